@@ -16,7 +16,7 @@ from mimic.arms.embodiment import Embodiment, Limits, load_arm, panda_path, plan
 from mimic.arms.ignored_elements import ignored_elements
 from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.arms.model_files import read_spec
-from mimic.arms.mujoco_chain import base_pose
+from mimic.arms.mujoco_chain import base_pose, chain_ends
 from mimic.arms.named_arms import BUILT_IN, is_arm_name, named_arm
 from mimic.arms.simulation_model import effective_inertia, simulation_model
 from mimic.base.config import suggestion
@@ -97,6 +97,7 @@ class Arm:
       locked: angle [rad] of the locked joints, by name.
       T_world_base: [4, 4] pose of the base frame in the world of the model, whose z-axis is vertical.
       notes: elements of its file that the model ignores, one line each.
+      ends: what each of its chains ends at, in words.
     """
 
     embodiment: Embodiment
@@ -104,6 +105,7 @@ class Arm:
     locked: Mapping[str, float]
     T_world_base: Float[np.ndarray, "4 4"]
     notes: tuple[str, ...] = ()
+    ends: tuple[str, ...] = ()
 
 
 class ArmPair(NamedTuple):
@@ -154,7 +156,8 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
     )
     notes = () if not config.is_file else ignored_elements(source, config.base, config.tip)
     model = simulation_model(source, embodiment.joint_names, angles)
-    arm = Arm(embodiment, model, angles, base_pose(source, config.base, config.tip), notes)
+    ends = chain_ends(source, config.base, config.tip)
+    arm = Arm(embodiment, model, angles, base_pose(source, config.base, config.tip), notes, ends)
     return with_minimum_armature(arm, config)
 
 

@@ -4,16 +4,15 @@ import re
 from collections.abc import Sequence
 from typing import Literal
 
+from mimic.arms.names import side, words
 from mimic.base.config import check_choice
 
 ChainMatch = Literal["name", "order"]
 CHAIN_MATCHES = ("name", "order")
 
-_SIDES = {"left": "left", "l": "left", "right": "right", "r": "right"}
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
 _CODES: dict[str, str] = dict(zip(("th", "ff", "mf", "rf", "lf"), _FINGERS, strict=True))  # of the Shadow hand
 _OTHER_WORDS = {"pinky": "little", "pinkie": "little", "forefinger": "index"}
-_WORD = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+")
 _ENDS = "|".join(("", "tip", "distal", "j"))  # what follows the code of a finger
 
 
@@ -50,9 +49,7 @@ def matched_chains(
 
 def _label(name: str) -> tuple[str, str]:
     """Side and finger of a chain, empty where its name has none."""
-    words = [word.lower() for word in _WORD.findall(name)]
-    side = next((_SIDES[word] for word in words if word in _SIDES), "")
-    return side, next(filter(None, map(_finger, words)), "")
+    return side(name), next(filter(None, map(_finger, words(name))), "")
 
 
 def _finger(word: str) -> str:

@@ -4,6 +4,7 @@ That process runs this file: it must import nothing of mimic at its start.
 """
 
 import math
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 SECONDS = 10  # CPU time; a Panda with meshes needs 1 s
@@ -44,49 +45,117 @@ def check_magnitudes(model: Any) -> None:
     for quantity, (maximum, names) in MAX_VALUES.items():
         for name in names:
             values = np.asarray(getattr(model, name))
-            wrong = values[~(np.abs(values) <= maximum)]
-            if wrong.size:
-                raise ValueError(f"the model has a {quantity} of {wrong[0]:g} ({name}); expected at most {maximum:g}")
+            for place in np.argwhere(~(np.abs(values) <= maximum))[:1]:
+                owner, value = _owner(model, name, int(place[0])), values[tuple(place)]
+                raise ValueError(
+                    f"the model has a {quantity} of {value:g}{owner} ({name}); expected at most {maximum:g}"
+                )
     for name in ("body_mass", "body_inertia", "dof_armature", "dof_damping"):
-        if np.any(np.asarray(getattr(model, name)) < 0):
-            raise ValueError(f"the model has a negative {name}; expected at least 0")
-    for limit in velocity_limits(model):
+        for place in np.argwhere(np.asarray(getattr(model, name)) < 0)[:1]:
+            owner = _owner(model, name, int(place[0]))
+            raise ValueError(f"the model has a negative {name}{owner}; expected at least 0")
+    for joint, limit in joint_numbers(model, VELOCITY_LIMIT).items():
         if not (0 < limit <= MAX_VELOCITY or limit == math.inf):
             raise ValueError(
-                f"the model has a velocity limit of {limit:g} rad/s; expected a number above 0 and of at most "
-                f"{MAX_VELOCITY:g}, or inf for a joint without a limit"
+                f"the model has a velocity limit of {limit:g} rad/s{_owner(model, 'jnt_range', joint)}; expected a "
+                f"number above 0 and of at most {MAX_VELOCITY:g}, or inf for a joint without a limit"
             )
 
 
-def velocity_limits(model: Any) -> list[float]:
-    """The velocity limit of each joint of a model [rad/s]; empty where it states none."""
+def _owner(model: Any, field: str, index: int) -> str:
+    """The element with an entry of a field, as " in joint 'elbow'"; "" where it has no name."""
+    kind, _, _ = field.partition("_")
+    if kind == "dof":
+        kind, index = "jnt", int(model.dof_jntid[index])
+    kinds = {"body": "body", "jnt": "joint", "site": "site", "geom": "geom", "actuator": "actuator"}
+    name = getattr(model, kinds[kind])(index).name if kind in kinds else ""
+    return f" in {kinds[kind]} {name!r}" if name else ""
+
+
+def joint_numbers(model: Any, name: str) -> dict[int, float]:
+    """What a model's custom numerics of a name state for its joints, by joint.
+
+    A numeric has a number for each joint, or for each revolute one. That of an attached model keeps its prefix, and is
+    for the joints with this prefix.
+
+    Raises:
+      ValueError: another number of numbers.
+    """
     import mujoco
 
-    numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, VELOCITY_LIMIT)
-    return list(map(float, model.numeric(numeric).data)) if numeric >= 0 else []
+    names = [model.joint(joint).name for joint in range(model.njnt)]
+    numerics = [model.numeric(number) for number in range(model.nnumeric)]
+    stated: dict[int, float] = {}
+    for numeric in sorted((x for x in numerics if x.name.endswith(name)), key=lambda x: -len(x.name)):
+        prefix = numeric.name.removesuffix(name)
+        joints = [joint for joint in range(model.njnt) if names[joint].startswith(prefix)]
+        if prefix and not joints:
+            continue
+        revolute = [joint for joint in joints if model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_HINGE)]
+        own = [joint for joint in joints if joint not in stated]
+        data = list(map(float, numeric.data))
+        matching = next((ids for ids in (joints, revolute, own) if len(ids) == len(data)), None)
+        if matching is None:
+            raise ValueError(
+                f"the model has {len(data)} numbers in {numeric.name}; expected one for each of {len(joints)} joints, "
+                f"or for each of the {len(revolute)} revolute ones"
+            )
+        stated.update(zip(matching, data, strict=True))
+    return stated
 
 
-def check_in_process(text: str) -> None:
+def check_in_process(text: str, attached: Mapping[str, str] | None = None, meshes: Iterable[str] = ()) -> list[str]:
     """Compiles a model in a process with limits, before this one does, and checks its magnitudes.
 
     Args:
       text: the model's XML, which names its files by absolute paths.
+      attached: the XML of the models that it attaches, by name.
+      meshes: files of meshes without which the model may be read.
+
+    Returns:
+      Those of `meshes` that MuJoCo cannot use. Where there are any, the model was not compiled.
 
     Raises:
       ValueError: MuJoCo rejects the model, crashes, or exceeds a limit; or what `check_magnitudes` rejects.
     """
     from mimic.base.limited_process import call_limited
 
-    call_limited(__file__, "compile_model", text, library="mujoco", what="the model", seconds=SECONDS)
+    arguments = text, dict(attached or {}), list(meshes)
+    return call_limited(__file__, "compile_model", *arguments, library="mujoco", what="the model", seconds=SECONDS)
 
 
-def compile_model(text: str) -> None:
+def compile_model(text: str, attached: dict[str, str], meshes: list[str]) -> list[str]:
     """What `check_in_process` runs there."""
+    try:
+        _compile(text, attached)
+    except ValueError:
+        unusable = [mesh for mesh in meshes if not _is_usable(mesh)]
+        if not unusable:
+            raise
+        return unusable
+    return []
+
+
+def _is_usable(mesh: str) -> bool:
+    """Whether MuJoCo reads a mesh: flat ones, and files of another kind than their names say, it rejects."""
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.add_mesh(name="mesh", file=mesh)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
+    try:
+        spec.compile()
+    except ValueError:
+        return False
+    return True
+
+
+def _compile(text: str, attached: dict[str, str]) -> None:
     import mujoco
 
     warnings: list[str] = []
     mujoco.set_mju_user_warning(warnings.append)
-    spec = mujoco.MjSpec.from_string(text)
+    spec = mujoco.MjSpec.from_string(text, include={name: part.encode() for name, part in attached.items()})
     spec.compiler.usethread = False
     model = spec.compile()
     if any("NaN" in warning for warning in warnings):  # in whatever attribute it is

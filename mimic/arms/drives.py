@@ -2,11 +2,11 @@
 
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.arm import Arm, ArmConfig, arm_spec, finite_velocity_limit
+from mimic.arms.compile_check import joint_numbers
 from mimic.control.limits import JointLimits, joint_limits
 
 # Names of custom numerics with a number for each joint of a model, in the order of its joints.
@@ -49,8 +49,8 @@ def drives_of(config: ArmConfig, arm: Arm) -> Drives:
     joints = [model.joint(name).id for name in arm.embodiment.joint_names]
 
     def stated(name: str) -> np.ndarray | None:
-        numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
-        return np.array(model.numeric(numeric).data, float)[joints] if numeric >= 0 else None
+        numbers = joint_numbers(model, name)
+        return np.array([numbers[joint] for joint in joints]) if set(joints) <= numbers.keys() else None
 
     torque = np.minimum(arm.embodiment.torque_limit, _UNLIMITED_TORQUE)
     position = np.asarray(arm.embodiment.joint_range, float)

@@ -1,12 +1,16 @@
 """Finds the arm in a MuJoCo model: the serial chain of revolute joints to a tip, or the tree to several."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import mujoco
 
+from mimic.arms.hand import named_frame
+from mimic.arms.names import hand_rank, is_gripper_joint, is_other_limb
+
 # As ints: a MuJoCo enum equals a NumPy integer in one order of the operands and not in the other.
 _REVOLUTE = int(mujoco.mjtJoint.mjJNT_HINGE)
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _COUPLED_JOINTS = int(mujoco.mjtEq.mjEQ_JOINT)
 _CONNECT, _WELD = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
 _SITE = int(mujoco.mjtObj.mjOBJ_SITE)
@@ -14,6 +18,7 @@ _KINDS = {int(kind): kind.name.removeprefix("mjJNT_").lower() for kind in mujoco
 
 Tip = str | Sequence[str] | None
 ALL_ENDS = "*"  # in a list of tips
+_MAX_ENDS = 6  # in a message
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,13 +59,14 @@ def find_chain(model: mujoco.MjModel, base: str | None = None, tip: Tip = None) 
       model: any.
       base: name of the body that carries the arm; where None, the parent of the first body with a joint of the arm, or
         the nearest common ancestor of several.
-      tip: name of the body or site at the end of the chain. Where None, the chain follows the longest branch, but stops
-        before a hand: branches that all have fewer revolute joints than the chain so far. A list of names gives a tree;
-        ["*"] stands for the ends of all branches.
+      tip: name of the body or site at the end of the chain. Where None, the chain follows the longest branch, without
+        grippers, heads and legs as far as names tell them, and up to the last tool that is named as one. It stops
+        before a hand: branches that all have fewer revolute joints than the chain so far. A list of names gives a
+        tree; ["*"] stands for the ends of all branches.
 
     Raises:
-      ValueError: no revolute joint, a joint of another kind between two revolute ones, branches of equal length, a
-        loop, or a name that the model lacks or that is listed twice.
+      ValueError: no revolute joint, a joint of another kind between two revolute ones, branches of equal length, two
+        coupled joints, a loop, or a name that the model lacks or that is listed twice.
     """
     start = 0 if base is None else body_id(model, base)
     tips, lasts = _ends(model, start, tip)
@@ -69,7 +75,8 @@ def find_chain(model: mujoco.MjModel, base: str | None = None, tip: Tip = None) 
     of_tree = {joint for chain in chains for joint in chain}
     revolute = tuple(joint for joint in range(model.njnt) if joint in of_tree)
     bodies = tuple(dict.fromkeys(int(model.jnt_bodyid[joint]) for joint in revolute))
-    _reject_loops(model, list(bodies))
+    _reject_coupled(model, of_tree)
+    _reject_loops(model, set(bodies))
     roots = {int(model.jnt_bodyid[chain[0]]) for chain in chains}
     others = [joint for joint in range(model.njnt) if joint not in of_tree]
     trunk = {body for root in roots for body in ancestors(model, root)}
@@ -112,7 +119,10 @@ def _common_parent(model: mujoco.MjModel, bodies: set[int]) -> int:
 
 
 def _revolute_joints(model: mujoco.MjModel, start: int, last: int) -> tuple[int, ...]:
-    """The revolute joints from a body to another, without those of the first."""
+    """The revolute joints from a body to another, without those of the first.
+
+    From the world on, where a joint of another kind is between them: those distal of it, if they are the more.
+    """
     line = ancestors(model, last)[::-1]
     bodies_from_base = line[line.index(start) + 1 :] if start in line else []
     joints = [joint for body in bodies_from_base for joint in joint_ids(model, body)]
@@ -121,6 +131,9 @@ def _revolute_joints(model: mujoco.MjModel, start: int, last: int) -> tuple[int,
         raise ValueError("the model has no revolute joint" + (" between base and tip" if start or last else ""))
     between = [j for j in joints[joints.index(revolute[0]) : joints.index(revolute[-1])] if not is_revolute(model, j)]
     if between:
+        distal = tuple(joint for joint in revolute if joints.index(joint) > joints.index(between[-1]))
+        if start == 0 and 2 * len(distal) > len(revolute):
+            return distal  # an arm on a lift or a mobile base
         name = model.joint(between[-1]).name
         raise ValueError(
             f"expected revolute joints only; joint {name!r} on the chain is a {joint_kind(model, between[-1])}: start "
@@ -182,43 +195,131 @@ def tip_body(model: mujoco.MjModel, tip: str) -> int:
 
 
 def _longest(model: mujoco.MjModel, start: int) -> int:
-    """The last body with a revolute joint on the longest chain distal to a body."""
-    counts = [sum(is_revolute(model, joint) for joint in joint_ids(model, body)) for body in range(model.nbody)]
-    below = list(counts)  # revolute joints on the longest chain from each body on
-    for body in range(model.nbody - 1, 0, -1):  # children come after their parents
-        parent = int(model.body_parentid[body])
-        below[parent] = max(below[parent], counts[parent] + below[body])
-    body, chain, last = start, 0, start
-    while True:
-        branches = [child for child in range(1, model.nbody) if model.body_parentid[child] == body and below[child]]
-        branches.sort(key=lambda child: -below[child])
-        if not branches or (len(branches) > 1 and chain > below[branches[0]]):
-            return last
-        if len(branches) > 1 and below[branches[0]] == below[branches[1]]:
-            names = " and ".join(repr(model.body(child).name) for child in branches[:2])
-            raise ValueError(
-                f"the model branches: bodies {names} lead to {below[branches[0]]} revolute joints each; name one end "
-                "with tip="
+    """The last body with a joint of an arm on the longest chain distal to a body, not beyond a tool."""
+    counts = _arm_joint_counts(model, start)
+    ends = list(_branch_ends(model, start, counts))
+    if len(ends) == 1:
+        return _before_tool(model, ends[0], counts)
+    total = sum(counts[body] for body in ancestors(model, ends[0]))
+    tools = [named_frame(model, end) for end in ends]
+    names = [tool or named_frame(model, end, hand_rank) or model.body(end).name
+             for tool, end in zip(tools, ends, strict=True)]  # fmt: skip
+    likeliest = next(filter(None, tools), names[0])
+    raise ValueError(
+        f"the model branches: {len(ends)} chains of {total} revolute joints end at "
+        f"{', '.join(map(repr, names[:_MAX_ENDS]))}{' and others' if len(names) > _MAX_ENDS else ''}; name one, as in "
+        f'tip={likeliest}, several, as in tip=[{",".join(names[:2])}], or all ends of the model with tip=["*"]'
+    )
+
+
+def _arm_joint_counts(model: mujoco.MjModel, start: int) -> list[int]:
+    """Number of revolute joints of each body that may be an arm's: without grippers and other limbs, if some remain."""
+    revolute = [[j for j in joint_ids(model, body) if is_revolute(model, j)] for body in range(model.nbody)]
+
+    def counts(is_left_out: Callable[[str, str], bool]) -> list[int]:
+        left_out = {0: False}
+        for body in range(1, model.nbody):
+            names = [model.joint(joint).name for joint in joint_ids(model, body)]
+            left_out[body] = left_out[int(model.body_parentid[body])] or any(
+                is_left_out(name, model.body(body).name) for name in names
             )
-        body = branches[0]
+        return [
+            0 if left_out[body] or start not in ancestors(model, body) else len(revolute[body]) for body in left_out
+        ]
+
+    rules = (lambda *names: is_gripper_joint(*names) or is_other_limb(*names), is_gripper_joint, lambda *_: False)
+    return next((found for rule in rules if any(found := counts(rule))), [0] * model.nbody)
+
+
+def _branch_ends(
+    model: mujoco.MjModel, body: int, counts: Sequence[int], chain: int = 0, last: int | None = None
+) -> Iterator[int]:
+    """The last body with a joint on each of the longest chains distal to a body, several if they are equally long.
+
+    Args:
+      model: with the chains.
+      body: at which they start.
+      counts: number of joints of each body.
+      chain: number of joints up to this body.
+      last: the last body with a joint up to this one.
+    """
+    distal = list(counts)  # joints on the longest chain from each body on
+    for child in range(model.nbody - 1, 0, -1):  # children come after their parents
+        parent = int(model.body_parentid[child])
+        distal[parent] = max(distal[parent], counts[parent] + distal[child])
+    last = body if last is None or counts[body] else last
+    while True:
+        branches = [child for child in range(1, model.nbody) if model.body_parentid[child] == body and distal[child]]
+        longest = [child for child in branches if distal[child] == max(distal[branch] for branch in branches)]
+        if not branches or (len(branches) > 1 and chain > distal[longest[0]]):
+            yield last
+            return
+        if len(longest) > 1:
+            for child in longest:
+                yield from _branch_ends(model, child, counts, chain + counts[child], last)
+            return
+        body = longest[0]
         chain += counts[body]
         last = body if counts[body] else last
 
 
-def _reject_loops(model: mujoco.MjModel, path: list[int]) -> None:
-    """Rejects an equality constraint on the chain's joints, or between bodies that these joints move apart."""
-    for equality in (i for i in range(model.neq) if model.eq_active0[i]):
-        kind, objects = model.eq_type[equality], (model.eq_obj1id[equality], model.eq_obj2id[equality])
-        if kind == _COUPLED_JOINTS:
-            between = {int(model.jnt_bodyid[joint]) for joint in objects if joint >= 0}
-        elif kind in (_CONNECT, _WELD):
-            on_sites = model.eq_objtype[equality] == _SITE
-            first, second = (model.site_bodyid[item] if on_sites else item for item in objects)
-            if max(model.body_mocapid[first], model.body_mocapid[second]) >= 0:
-                continue  # a mocap handle that drags the arm, not a part of it
-            between = set(ancestors(model, first)) ^ set(ancestors(model, second))
-        else:
-            continue
-        if between & set(path):
+def _before_tool(model: mujoco.MjModel, last: int, counts: Sequence[int]) -> int:
+    """The last body of a chain, or an earlier one with a tool, if fewer joints are distal of it than proximal."""
+    distal = 0
+    for body in (body for body in ancestors(model, last) if counts[body]):
+        proximal = sum(counts[part] for part in ancestors(model, body))
+        if distal >= proximal:
+            break
+        if named_frame(model, body):
+            return body
+        distal += counts[body]
+    return last
+
+
+def _reject_coupled(model: mujoco.MjModel, joints: set[int]) -> None:
+    """Rejects an equality constraint between joints of the arm; others follow it, and move nothing of it."""
+    for equality in _active(model, _COUPLED_JOINTS):
+        coupled = {int(j) for j in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if j >= 0}
+        if coupled <= joints:
+            names = " and ".join(repr(model.joint(joint).name) for joint in sorted(coupled))
+            raise ValueError(
+                f"expected joints that move on their own; {names} of the arm "
+                f"{'are coupled' if len(coupled) > 1 else 'is held'} by an equality constraint or <mimic>: end the arm "
+                "before with tip=, or remove the coupling"
+            )
+
+
+def _active(model: mujoco.MjModel, *kinds: int) -> Iterator[int]:
+    yield from (i for i in range(model.neq) if model.eq_active0[i] and model.eq_type[i] in kinds)
+
+
+def _reject_loops(model: mujoco.MjModel, path: set[int]) -> None:
+    """Rejects a constraint between bodies that the joints of the arm move apart, directly or by way of free bodies."""
+    tied: dict[int, list[tuple[int, int]]] = {}  # by the free body: what is tied to it, and the constraint
+    pairs: list[tuple[int, int, int]] = []
+    for equality in _active(model, _CONNECT, _WELD):
+        on_sites = model.eq_objtype[equality] == _SITE
+        objects = model.eq_obj1id[equality], model.eq_obj2id[equality]
+        first, second = (int(model.site_bodyid[item]) if on_sites else int(item) for item in objects)
+        if max(model.body_mocapid[first], model.body_mocapid[second]) >= 0:
+            continue  # a mocap handle that drags the arm, not a part of it
+        pairs.append((first, second, equality))
+    free = {body for pair in pairs for body in pair[:2] if _is_free(model, body, path)}
+    for first, second, equality in pairs:
+        for body, other in ((first, second), (second, first)):
+            if body in free:
+                tied.setdefault(int(model.body_rootid[body]), []).append((other, equality))
+    pairs = [pair for pair in pairs if not free & set(pair[:2])]
+    for ties in tied.values():  # what holds a free body is tied by it
+        pairs += [(ties[0][0], other, equality) for other, equality in ties[1:]]
+    for first, second, equality in pairs:
+        if path & (set(ancestors(model, first)) ^ set(ancestors(model, second))):
             name = model.eq(equality).name or f"number {equality + 1}"
             raise ValueError(f"expected a chain or a tree; the model has a loop, closed by equality constraint {name}")
+
+
+def _is_free(model: mujoco.MjModel, body: int, path: set[int]) -> bool:
+    """Whether a body belongs to an object that moves freely and carries nothing of the arm."""
+    root = int(model.body_rootid[body])
+    is_arm = any(int(model.body_rootid[part]) == root for part in path)
+    return not is_arm and any(int(model.jnt_type[joint]) == _FREE for joint in joint_ids(model, root))

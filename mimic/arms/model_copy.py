@@ -20,7 +20,8 @@ def copied_files(source: ModelSource, name: str) -> Mapping[str, bytes | Path]:
     # The names of the files stay, since MuJoCo names meshes by them.
     places = {str(file): f"{_ASSETS}/{number}/{file.name}" for number, file in enumerate(source.files)}
     files: dict[str, bytes | Path] = {place: Path(file) for file, place in places.items()}
-    files[name] = ElementTree.tostring(_with_paths(source.root, places))
+    for file, root in {**source.attached, name: source.root}.items():
+        files[file] = ElementTree.tostring(_with_paths(root, places))
     return files
 
 

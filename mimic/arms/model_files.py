@@ -1,15 +1,18 @@
 """Reads MJCF and URDF files, and rejects unsafe ones with a one-line error before MuJoCo compiles them here."""
 
+import contextlib
 import functools
 import logging
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
 
 from mimic.arms.compile_check import VELOCITY_LIMIT, check_in_process, check_magnitudes
 from mimic.arms.model_source import ModelSource, read_source
+from mimic.arms.urdf import stated_velocities
 
 _UNNAMED_MODEL = "MuJoCo Model"  # MuJoCo's name of a model without one
 _MAX_MESSAGE = 400  # characters of MuJoCo's messages, which may repeat a whole attribute
@@ -23,8 +26,8 @@ _log = logging.getLogger(__name__)
 def read_spec(path: str | os.PathLike[str]) -> mujoco.MjSpec:
     """An MJCF or URDF file as a MuJoCo spec that compiles, in which every joint and body has a name.
 
-    A URDF keeps the names of its fixed links and its velocity limits. Its missing meshes are left out, since the file
-    states the inertias itself.
+    A URDF keeps the names of its fixed links and its velocity limits. Meshes that are missing or that MuJoCo cannot use
+    are left out; what else is changed in it, a line says.
 
     Raises:
       ValueError: what `read_source` and `check_in_process` reject: MuJoCo compiles the file in another process first.
@@ -51,23 +54,43 @@ def _read(path: str | os.PathLike[str]) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     shown = repr(os.fspath(path))
     source = None if _is_bundled(Path(path)) else read_source(path)
     try:
-        if source is None:
-            spec = mujoco.MjSpec.from_file(os.fspath(path))
-        else:
-            _check(source)
-            spec = mujoco.MjSpec.from_string(source.text)
-            if source.is_urdf:
-                _restore_urdf_data(spec, source)
-        model = spec.compile()
-        if _name_unnamed(spec):
+        with _warnings_as_lines(shown):
+            if source is None:
+                spec = mujoco.MjSpec.from_file(os.fspath(path))
+            else:
+                if unusable := _check(source):
+                    source = read_source(path, unusable)
+                    _check(source)
+                spec = _uncompiled(source)
             model = spec.compile()
-        if source is not None:
-            check_magnitudes(model)
+            if _name_unnamed(spec):
+                model = spec.compile()
+            if source is not None:
+                check_magnitudes(model)
     except (ValueError, mujoco.FatalError) as error:
         raise ValueError(_reason(shown, " ".join(str(error).split()))) from error
-    if source is not None and source.missing:
-        _warn_missing_meshes(Path(path), len(source.missing), source.missing[0])
+    if source is not None:
+        _warn(shown, source.missing, source.notes)
     return spec, model
+
+
+def _uncompiled(source: ModelSource) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec.from_string(source.text, include={name: xml.encode() for name, xml in source.texts.items()})
+    if source.is_urdf:
+        _restore_urdf_data(spec, source)
+    return spec
+
+
+@contextlib.contextmanager
+def _warnings_as_lines(shown: str) -> Iterator[None]:
+    """Logs MuJoCo's warnings about a model, which it would write to the terminal and a file."""
+    warnings: list[str] = []
+    mujoco.set_mju_user_warning(warnings.append)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(None)
+        _warn(shown, (), tuple(dict.fromkeys(" ".join(warning.split()) for warning in warnings)))
 
 
 def _is_bundled(file: Path) -> bool:
@@ -76,8 +99,10 @@ def _is_bundled(file: Path) -> bool:
 
 
 @functools.cache  # a run reads a model several times
-def _check(source: ModelSource) -> None:
-    check_in_process(source.text)
+def _check(source: ModelSource) -> list[str]:
+    """Checks a model; returns the meshes of a URDF without which it is to be read again."""
+    meshes = [str(file) for file in source.files] if source.is_urdf else []
+    return check_in_process(source.text, source.texts, meshes)
 
 
 def _reason(shown: str, message: str) -> str:
@@ -96,27 +121,19 @@ def _restore_urdf_data(spec: mujoco.MjSpec, source: ModelSource) -> None:
     """Names of fixed links and velocity limits, which MuJoCo drops from a URDF."""
     spec.compiler.fusestatic = False
     spec.compile()  # numbers the joints
-    limits: dict[str | None, float] = {}
-    for joint in source.root.iter("joint"):
-        limit = joint.find("limit")
-        if limit is not None:
-            limits[joint.get("name")] = _number(limit.get("velocity", "0"))
+    limits = stated_velocities(source.root)
     joints = sorted(spec.joints, key=lambda joint: joint.id)
     if joints:
         numeric = spec.add_numeric(name=VELOCITY_LIMIT, size=len(joints))
-        numeric.data = [limits.get(joint.name, 0.0) or float("inf") for joint in joints]
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"a velocity limit: expected a number, got {text!r}") from None
+        numeric.data = [limits.get(joint.name, float("inf")) for joint in joints]
 
 
 @functools.cache  # warns once, though a run reads a model several times
-def _warn_missing_meshes(file: Path, count: int, first: str) -> None:
-    _log.warning("%s: ignored %d meshes that cannot be read, the first %s", file, count, first)
+def _warn(shown: str, missing: tuple[str, ...], notes: tuple[str, ...]) -> None:
+    if missing:
+        _log.warning("%s: ignored %d meshes that cannot be read, the first %s", shown, len(missing), missing[0])
+    for note in notes:
+        _log.warning("%s: %s", shown, note)
 
 
 def _name_unnamed(spec: mujoco.MjSpec) -> bool:

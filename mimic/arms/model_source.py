@@ -8,10 +8,12 @@ import dataclasses
 import hashlib
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
+from typing import NoReturn
 from xml.etree import ElementTree
 
+from mimic.arms.urdf import mend_urdf
 from mimic.base.files import check_file, file_digest, read_bytes
 
 MAX_FILE_SIZE = 8 * 2**20  # bytes of XML; the largest robot models known to us have 1 MiB
@@ -23,6 +25,8 @@ _PACKAGE = re.compile(r"package:/+([^/]+)/(.*)", re.DOTALL)
 _COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)
 _TAG = re.compile(r"<[^<>]*>")
 _MESH_FORMATS = (".stl", ".obj", ".msh")
+_EXPRESSION = re.compile(r"\$[{(]")
+_TEMPLATES = {"include", "macro", "property", "arg", "if", "unless"}  # elements of xacro that make a file a template
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,15 +35,19 @@ class ModelSource:
 
     Attributes:
       digest: checksum of the XML and of all files.
-      root: the XML, whose `file` attributes are absolute paths.
+      root: the XML, whose `file` attributes are absolute paths, or names of `attached`.
       files: the meshes, textures and height fields.
-      missing: meshes of a URDF that were left out, since there is no such file.
+      missing: meshes of a URDF that were left out, since there is no such file or MuJoCo cannot use it.
+      attached: the models that it attaches, by the names that it has for them.
+      notes: what was changed or assumed in a URDF, one line each.
     """
 
     digest: str
     root: ElementTree.Element = dataclasses.field(compare=False)
     files: tuple[Path, ...] = dataclasses.field(compare=False)
     missing: tuple[str, ...] = dataclasses.field(compare=False)
+    attached: Mapping[str, ElementTree.Element] = dataclasses.field(compare=False)
+    notes: tuple[str, ...] = dataclasses.field(compare=False)
 
     @property
     def is_urdf(self) -> bool:
@@ -51,30 +59,41 @@ class ModelSource:
         """The XML, with each element in the line that it has in its file, as far as there are no includes."""
         return ElementTree.tostring(self.root, "unicode")
 
+    @property
+    def texts(self) -> dict[str, str]:
+        """The XML of the models that it attaches, by name."""
+        return {name: ElementTree.tostring(root, "unicode") for name, root in self.attached.items()}
 
-def read_source(path: str | os.PathLike[str]) -> ModelSource:
-    """Reads a model with all that it includes.
+
+def read_source(path: str | os.PathLike[str], unusable: Collection[str] = ()) -> ModelSource:
+    """Reads a model with all that it includes and attaches.
+
+    Args:
+      path: of the file.
+      unusable: meshes that a URDF is to be read without, as absolute paths.
 
     Raises:
-      ValueError: the file does not exist, is too large or no XML, has entities, or needs files that do not exist, are
-        no regular files, or are outside its folder. The message is one line.
+      ValueError: the file does not exist, is too large, no XML or a xacro, has entities, names two of its elements
+        alike, or needs files that do not exist, are no regular files, or are outside its folder. The message is one
+        line.
     """
     shown = repr(os.fspath(path))
     if not os.path.isfile(path):
         raise ValueError(f"no MJCF or URDF file at {shown}{', which is no file' if os.path.exists(path) else ''}")
     file = Path(os.path.realpath(path))
-    reader = _Reader(shown, file.parent)
+    reader = _Reader(shown, file.parent, unusable)
     try:
         root = reader.read(file)
         files = tuple(dict.fromkeys(reader.files))
-        digest = hashlib.sha256(ElementTree.tostring(root))
+        digest = hashlib.sha256(b"".join(map(ElementTree.tostring, [root, *reader.attached.values()])))
     except RecursionError:
         raise ValueError(f"{shown} has too many levels of XML") from None
     if (size := sum(file.stat().st_size for file in files)) > MAX_ASSET_SIZE:
         raise ValueError(f"{shown} has files of {size:,} bytes; expected at most {MAX_ASSET_SIZE:,}")
     for asset in files:
         digest.update(file_digest(asset).encode())
-    return ModelSource(digest.hexdigest(), root, files, tuple(reader.missing))
+    notes = tuple(reader.notes)
+    return ModelSource(digest.hexdigest(), root, files, tuple(reader.missing), reader.attached, notes)
 
 
 class _Reader:
@@ -83,35 +102,64 @@ class _Reader:
     Args:
       shown: the model, for messages.
       folder: the folder that it and its includes are in; meshes and textures may also be next to it.
+      unusable: meshes to leave out.
     """
 
-    def __init__(self, shown: str, folder: Path):
+    def __init__(self, shown: str, folder: Path, unusable: Collection[str]):
         self._shown = shown
         self._folder = folder
+        self._unusable = unusable
         is_top = folder.parent == folder.parent.parent  # everything would be next to it
         self._package = folder if is_top else folder.parent
         self.files: list[Path] = []
         self.missing: list[str] = []
+        self.attached: dict[str, ElementTree.Element] = {}
+        self.notes: list[str] = []
 
-    def read(self, file: Path) -> ElementTree.Element:
-        """The tree of a model with its includes, whose files are located."""
+    def read(self, file: Path, parents: tuple[Path, ...] = ()) -> ElementTree.Element:
+        """The tree of a model with its includes, whose files are located.
+
+        Args:
+          file: of the model.
+          parents: the models that attach it.
+        """
         root = self._with_includes(file)
         mesh_folder, texture_folder, strips_paths = _read_compilers(root)
         is_urdf = root.tag == "robot"
         if is_urdf:
             self._locate_urdf_meshes(root, (file.parent / mesh_folder, file.parent))
+            self.notes += self._mended(root)
         for element in (part for model in (root.findall("mujoco") if is_urdf else [root]) for part in model.iter()):
             for attribute in [name for name in element.attrib if name.lower().startswith("file")]:
                 if not (name := element.attrib[attribute]):
                     continue
                 if element.tag.lower() == "model":
-                    raise ValueError(f"{self._shown} attaches the model {name!r:.200}; expected includes, or one file")
+                    element.attrib[attribute] = self._attach(name, (*parents, file))
+                    continue
                 name = re.split(r"[/\\]", name)[-1] if strips_paths and not is_urdf else name
                 folder = texture_folder if element.tag.lower() == "texture" else mesh_folder
                 asset = self._file(name, (file.parent / folder, file.parent), self._package)
                 element.attrib[attribute] = str(asset)
                 self.files.append(asset)
         return root
+
+    def _attach(self, name: str, parents: tuple[Path, ...]) -> str:
+        """Reads a model that the last of `parents` attaches; returns its name among those attached."""
+        part = self._file(name, (parents[-1].parent,), self._folder)
+        if part in parents:
+            raise ValueError(f"{self._unreadable}: it attaches {name!r:.200} to itself")
+        root = self.read(part, parents)
+        if root.tag != "mujoco":
+            raise ValueError(f"{self._shown} attaches {name!r:.200}, which is no MJCF; expected MJCF")
+        attached = f"{part.stem}-attached{len(self.attached)}.xml"
+        self.attached[attached] = root
+        return attached
+
+    def _mended(self, root: ElementTree.Element) -> tuple[str, ...]:
+        try:
+            return mend_urdf(root)
+        except ValueError as error:
+            raise ValueError(f"{self._shown} is rejected: {error}") from None
 
     def _with_includes(self, file: Path) -> ElementTree.Element:
         """The tree of a file, with the content of each included file in its place."""
@@ -168,7 +216,7 @@ class _Reader:
             places = [(self._package, folder / name.removeprefix("file://")) for folder in folders]
         for bounds, place in places:
             path = Path(os.path.realpath(place))
-            is_mesh = path.suffix.lower() in _MESH_FORMATS and path.is_file()
+            is_mesh = path.suffix.lower() in _MESH_FORMATS and path.is_file() and str(path) not in self._unusable
             if is_mesh and path.is_relative_to(os.path.realpath(bounds)):
                 return path
         return None
@@ -189,6 +237,12 @@ class _Reader:
             ) from None
         except (OSError, ValueError) as error:
             raise ValueError(f"{self._shown} needs {name!r:.200}, which cannot be read: {error!s:.200}") from None
+
+    def _reject_xacro(self) -> NoReturn:
+        raise ValueError(
+            f"{self._shown} is a xacro, a template of a URDF; expand it first, with `xacro FILE -o arm.urdf` of ROS or "
+            "`xacrodoc FILE -o arm.urdf` (pip install xacrodoc)"
+        )
 
     @property
     def _unreadable(self) -> str:
@@ -212,12 +266,24 @@ class _Reader:
         try:
             root = ElementTree.fromstring(text.lstrip("\r\n\t ") if text.lstrip().startswith("<?xml") else text)
         except ElementTree.ParseError as error:
+            if "unbound prefix" in str(error) and "<xacro:" in text:
+                self._reject_xacro()
             raise ValueError(f"{self._unreadable}: {file.name!r}: {error}") from None
+        if root.tag == "robot" and _is_xacro(root):
+            self._reject_xacro()
         for element in root.iter():
             for name, value in element.attrib.items():
                 if not value.isprintable():  # a name must not break a message's line
                     element.attrib[name] = "".join(c if c.isprintable() else " " for c in value)
         return root
+
+
+def _is_xacro(root: ElementTree.Element) -> bool:
+    """Whether a URDF is a template; calls of macros that an expanded file still has are nothing of a robot."""
+    names = {element.tag.partition("}")[2] for element in root.iter() if "xacro" in element.tag.partition("}")[0]}
+    parts = (part for tag in ("link", "joint") for element in root.findall(tag) for part in element.iter())
+    has_expressions = any(_EXPRESSION.search(value) for part in parts for value in part.attrib.values())
+    return has_expressions or bool(names & _TEMPLATES) or bool(names and root.find("joint") is None)
 
 
 def _read_compilers(root: ElementTree.Element) -> tuple[str, str, bool]:

@@ -9,13 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.chain import SHORTEST_LINK, Chain, Joint, Link, drop_zero_length
-from mimic.arms.compile_check import velocity_limits
-from mimic.arms.kinematic_tree import Tip, ancestors, find_chain, is_revolute, tip_body
+from mimic.arms.compile_check import VELOCITY_LIMIT, joint_numbers
+from mimic.arms.hand import ArmEnd, find_end
+from mimic.arms.kinematic_tree import Tip, find_chain, is_revolute, tip_body
 
 START_POSES = "ready", "home"  # keyframes with the start pose of a model, in order of preference
 
 # As ints: a MuJoCo enum equals a NumPy integer in one order of the operands and not in the other.
-_CAPSULE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
+_CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
 _ON_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _NO_BIAS = int(mujoco.mjtBias.mjBIAS_NONE)
 _WORLD = 0  # body
@@ -42,6 +43,7 @@ def read_chain(model: mujoco.MjModel, base: str | None = None, tip: Tip = None, 
     def in_base(point: np.ndarray) -> np.ndarray:
         return R_base_world @ (point - origin)
 
+    velocities = joint_numbers(model, VELOCITY_LIMIT)
     index = {joint_id: joint for joint, joint_id in enumerate(chain_ids.joints)}
     paths = [[index[joint_id] for joint_id in chain] for chain in chain_ids.chains]
     joints: list[Joint] = []
@@ -49,13 +51,14 @@ def read_chain(model: mujoco.MjModel, base: str | None = None, tip: Tip = None, 
     for body in chain_ids.bodies:
         for joint_id in (joint for joint in chain_ids.joints if model.jnt_bodyid[joint] == body):
             axis, anchor = R_base_world @ data.xaxis[joint_id], in_base(data.xanchor[joint_id])
-            joints.append(_joint(model, joint_id, axis, anchor, f"joint{len(joints) + 1}"))
+            name = model.joint(joint_id).name or f"joint{len(joints) + 1}"
+            joints.append(_joint(model, joint_id, name, axis, anchor, velocities.get(joint_id, np.inf)))
         links += _site_links(model, data, body, len(joints) - 1, in_base, paths)
     _check_names(joints)
     if not links:
         has_base = base_segment and (base is not None or chain_ids.base != _WORLD)
         ends = zip(chain_ids.chains, chain_ids.tips, strict=True)
-        tips = [in_base(_tip_point(model, data, chain, name)) for chain, name in ends]
+        tips = [in_base(_chain_end(model, data, chain[-1], name).point) for chain, name in ends]
         links = (_base_links(joints, paths) if has_base else []) + _anchor_links(joints, paths, tips)
     if len(paths) == 1:
         return Chain(tuple(joints), drop_zero_length(links))
@@ -80,19 +83,20 @@ def _chains_with(joint: int, paths: Sequence[Sequence[int]]) -> tuple[int, ...]:
     return tuple(number for number, path in enumerate(paths) if joint in path)
 
 
-def _joint(model: mujoco.MjModel, joint_id: int, axis: np.ndarray, anchor: np.ndarray, default_name: str) -> Joint:
+def _joint(
+    model: mujoco.MjModel, joint_id: int, name: str, axis: np.ndarray, anchor: np.ndarray, velocity_limit: float
+) -> Joint:
     """A joint of the model, with axis and anchor in the base frame; home from the keyframe with the start pose."""
-    key = _start_keyframe(model)
     limited = bool(model.jnt_limited[joint_id])
     low, high = map(float, model.jnt_range[joint_id]) if limited else (-np.pi, np.pi)
-    start = float(model.key_qpos[key, model.jnt_qposadr[joint_id]]) if key >= 0 else 0.0
+    start = _start_angle(model, joint_id)
     return Joint(
-        name=model.joint(joint_id).name or default_name,
+        name=name,
         axis=axis,
         anchor=anchor,
         range=(low, high),
         torque_limit=_torque_limit(model, joint_id),
-        velocity_limit=dict(enumerate(velocity_limits(model))).get(joint_id, np.inf),
+        velocity_limit=velocity_limit,
         home=float(np.clip(start, low, high)) if limited else start,
     )
 
@@ -157,41 +161,20 @@ def _link_name(pair: tuple[int, int], pairs: Sequence[tuple[int, int]], joints: 
     return joints[joint].name + (f"-{joints[following].name if following >= 0 else 'tip'}" if branches else "")
 
 
-def _tip_point(model: mujoco.MjModel, data: mujoco.MjData, joints: Sequence[int], tip: str | None) -> np.ndarray:
-    """End of the last link of a chain of joints.
-
-    The named tip; else the farthest site or body distal to the last joint; else the farthest end of a geom; else the
-    centre of mass of the last body.
-    """
-    if tip is not None:
-        site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)
-        return data.site_xpos[site] if site >= 0 else data.xpos[tip_body(model, tip)]
-    last = int(model.jnt_bodyid[joints[-1]])
-    subtree = [body for body in range(1, model.nbody) if last in ancestors(model, body)]
-    points = [data.site_xpos[site] for site in range(model.nsite) if model.site_bodyid[site] in subtree]
-    points += [data.xpos[body] for body in subtree if body != last]
-    anchor = data.xanchor[joints[-1]]
-
-    def distance(point: np.ndarray) -> float:
-        return float(np.linalg.norm(point - anchor))
-
-    def is_at_anchor() -> bool:
-        return max(map(distance, points), default=0.0) <= SHORTEST_LINK
-
-    if is_at_anchor():
-        points += _geom_ends(model, data, subtree)
-    if is_at_anchor():
-        points = [data.xipos[last]]
-    return max(points, key=distance)
+def _chain_end(model: mujoco.MjModel, data: mujoco.MjData, joint: int, tip: str | None) -> ArmEnd:
+    """End of the last link of a chain: the named tip, or what `find_end` finds distal of its last joint."""
+    if tip is None:
+        return find_end(model, data, joint)
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)
+    point = data.site_xpos[site] if site >= 0 else data.xpos[tip_body(model, tip)]
+    return ArmEnd(point, f"{'site' if site >= 0 else 'body'} {tip!r}, as tip= says")
 
 
-def _geom_ends(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> list[np.ndarray]:
-    points = []
-    for geom in (g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies):
-        is_rod = model.geom_type[geom] in (_CAPSULE, _CYLINDER)
-        half = data.geom_xmat[geom].reshape(3, 3)[:, 2] * (model.geom_size[geom, 1] if is_rod else 0)
-        points += [data.geom_xpos[geom] + half, data.geom_xpos[geom] - half]
-    return points
+def chain_ends(model: mujoco.MjModel, base: str | None = None, tip: Tip = None) -> tuple[str, ...]:
+    """What each chain of an arm ends at, in words; see `find_chain`."""
+    chain_ids, data = find_chain(model, base, tip), data_at_zero(model)
+    ends = zip(chain_ids.chains, chain_ids.tips, strict=True)
+    return tuple(_chain_end(model, data, chain[-1], name).reason for chain, name in ends)
 
 
 def base_pose(model: mujoco.MjModel, base: str | None = None, tip: Tip = None) -> Float[np.ndarray, "4 4"]:
@@ -210,10 +193,14 @@ def data_at_zero(model: mujoco.MjModel) -> mujoco.MjData:
     return data
 
 
-def _start_keyframe(model: mujoco.MjModel) -> int:
-    """Id of the keyframe with the start pose; -1 where there is none."""
-    keys = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name) for name in START_POSES)
-    return next((key for key in keys if key >= 0), -1)
+def _start_angle(model: mujoco.MjModel, joint_id: int) -> float:
+    """Angle of a joint in the keyframe with the start pose, which may be that of an attached model; 0 without one."""
+    joint, start = model.joint(joint_id).name, 0.0
+    for pose in reversed(START_POSES):
+        for key in sorted((model.key(i) for i in range(model.nkey)), key=lambda key: -len(key.name)):
+            if key.name.endswith(pose) and joint.startswith(key.name.removesuffix(pose)):
+                start = float(key.qpos[model.jnt_qposadr[joint_id]])
+    return start
 
 
 def _torque_limit(model: mujoco.MjModel, joint_id: int) -> float:

@@ -45,6 +45,8 @@ def expand_arms(arguments: Sequence[str], command: str) -> list[str]:
         if command == "view" and role == "expert" and "source" in keys:
             raise ValueError("expert: expected none with source=, whose person is the expert")
         full = f"{_PREFIXES[command]}{role}"
+        if not dot and value == _TEMPLATE and sum(other in (role, full) for other in keys) > 1:
+            continue  # the pair's arm is the one that another key names
         if dot or value.startswith(("{", "$")):
             others.append(f"{full}{dot}{field}={value}")
         else:

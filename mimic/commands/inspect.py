@@ -37,6 +37,7 @@ class Inspection:
 
     Attributes:
       joints, links: tables of the learner's joints and links, one entry for each row.
+      ends: what the learner's chains end at.
       ignored: elements of the model that are ignored.
       assumed: values that the model lacks.
       warnings: reasons why the learner may imitate badly.
@@ -47,6 +48,7 @@ class Inspection:
 
     joints: list[dict[str, Any]]
     links: list[dict[str, Any]]
+    ends: list[str]
     ignored: list[str]
     assumed: list[str]
     warnings: list[str]
@@ -101,6 +103,7 @@ def _inspect(
     return Inspection(
         joints=_joints(learner, config.learner, env),
         links=_links(expert, learner, env),
+        ends=list(learner.ends),
         ignored=list(learner.notes),
         assumed=list(arm_checks.assumptions(config.learner, learner)),
         warnings=[*arm_checks.warnings(config.learner, learner), *([reason] if reason else [])],
@@ -114,7 +117,12 @@ def _print(console: Console, inspection: Inspection, expert: Arm, learner: Arm) 
     console.print(_headline(expert, learner), highlight=False, soft_wrap=True)
     console.print(_table(f"joints of {learner.embodiment.name}", inspection.joints))
     console.print(_table("links, and the expert links that they are compared with", inspection.links))
-    notes = {"ignored": inspection.ignored, "assumed": inspection.assumed, "warning": inspection.warnings}
+    notes = {
+        "ends at": inspection.ends,
+        "ignored": inspection.ignored,
+        "assumed": inspection.assumed,
+        "warning": inspection.warnings,
+    }
     for label, lines in notes.items():
         for line in lines:
             console.print(f"{label}: {escape(line)}", highlight=False, soft_wrap=True)
@@ -131,6 +139,7 @@ def _write(path: Path, inspection: Inspection, expert: Arm, learner: Arm) -> Non
         "expert": expert.embodiment.name,
         "joints": inspection.joints,
         "links": inspection.links,
+        "ends": inspection.ends,
         "set_aside": inspection.ignored,
         "assumed": inspection.assumed,
         "mind": inspection.warnings,

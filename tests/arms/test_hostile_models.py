@@ -102,7 +102,7 @@ def mesh(name):
     return f'<asset><mesh name="z" file="{name}"/></asset>'
 
 
-MODEL = '<asset><model name="z" file="other.xml"/></asset>'
+MODEL = '<asset><model name="z" file="../other.xml"/></asset>'
 PARTS = {
     "a mesh outside": (mesh("../../secret.obj"), "needs '../../secret.obj', .* outside"),
     "a link": (mesh("link.obj"), "needs 'link.obj', .* outside"),
@@ -112,7 +112,9 @@ PARTS = {
     "an include that is a pipe": (PLAIN.replace("{}", "pipe"), "'pipe', .* got a named pipe"),
     "a loop of links": (PLAIN.replace("{}", "loop.xml"), "needs 'loop.xml', which cannot be read"),
     "an include of itself": (PLAIN.replace("{}", "arm.xml"), "includes 'arm.xml' twice"),
-    "an attached model": (MODEL, "attaches the model 'other.xml'; expected includes, or one file"),
+    "an attached model": (MODEL, "needs '../other.xml', .* outside"),
+    "an attached model that is absent": (MODEL.replace("../other", "other"), "'other.xml', which does not exist"),
+    "an attached model that is itself": (MODEL.replace("../other", "arm"), "attaches 'arm.xml' to itself"),
     "levels": ("<body>" * 20_000 + "</body>" * 20_000, "too many levels"),
     "elements": ("<a/>" * (MAX_ELEMENTS + 1), "too many XML elements"),
 }
@@ -131,19 +133,19 @@ def test_a_model_that_is_no_file_is_rejected(folder, name):
 
 
 MAGNITUDES = {
-    "mass": ('mass="8.4"', 'mass="1e30"', r"mass \[kg\] of 1e\+30"),
+    "mass": ('mass="8.4"', 'mass="1e30"', r"mass \[kg\] of 1e\+30 in body 'lift_link' \(body_mass\)"),
     "mass just above": ('mass="8.4"', 'mass="1.1e5"', r"mass \[kg\] of 110000"),
     "position": ('pos="0 0.14 0"', 'pos="0 1e30 0"', r"position \[m\] of 1e\+30"),
     "range": ('range="-6.2 6.2"', 'range="-1e30 6.2"', r"joint range .* of -1e\+30"),
     "rotor inertia": ('armature="0.1"', 'armature="1e30"', r"rotor inertia .* of 1e\+30"),
-    "damping": ('damping="1.0"', 'damping="-1"', "negative dof_damping"),
+    "damping": ('damping="1.0"', 'damping="-1"', "negative dof_damping in joint 'pan'"),
     "torque": ('ctrlrange="-150 150"', 'ctrlrange="-1e30 150"', r"actuator parameter of -1e\+30"),
     "bodies": ("<worldbody>", f"<worldbody>{BALL * 1001}", "the model has nbody = "),
     **{
         f"speed {speed}": (
             "<worldbody>",
-            f'<custom><numeric name="velocity_limit" data="1 {speed}"/></custom><worldbody>',
-            f"velocity limit of .* rad/s; expected .* at most {MAX_VELOCITY:g}",
+            f'<custom><numeric name="velocity_limit" data="1 1 1 1 1 {speed}"/></custom><worldbody>',
+            f"velocity limit of .* rad/s in joint 'wrist_3'; expected .* at most {MAX_VELOCITY:g}",
         )
         for speed in ("-1", "1e5", "nan")
     },

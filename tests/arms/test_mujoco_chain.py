@@ -7,6 +7,8 @@ import pytest
 
 from mimic.arms import chain
 from mimic.arms.embodiment import load_arm, load_mjcf, panda, panda_path
+from mimic.arms.model_copy import copied_files
+from mimic.arms.model_source import read_source
 from mimic.metric.kinematics import link_states
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # the messages are those of mimic
@@ -50,20 +52,6 @@ def test_links_run_from_anchor_to_anchor_to_tip():
     assert arm.link_position.tolist() == [[0.5, 0, 0], [1.25, 0, 0]]
     assert arm.link_lengths.tolist() == [1, 0.5]
     assert np.isinf(arm.torque_limit).all()
-
-
-@pytest.mark.parametrize(
-    ("inner", "end"),
-    [
-        (TIP, 0.5),
-        ('<body pos="0.7 0 0"><geom size="0.1"/></body>' + TIP, 0.7),
-        ('<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02"/>', 0.3),
-        ('<geom pos="0.2 0 0" size="0.02"/>', 0.2),
-    ],
-    ids=["site", "body", "capsule", "ball"],
-)
-def test_the_last_link_ends_at_the_farthest_point(inner, end):
-    assert load_mjcf(toy(inner)).link_lengths.tolist() == pytest.approx([1, end])
 
 
 @pytest.mark.parametrize("tilt", [0.0, 1e-13, 1e-9, 1e-6, 1e-3])
@@ -198,6 +186,45 @@ def test_velocity_limits_and_the_start_pose_come_from_the_model():
     assert (arm.joint_range.tolist(), arm.home.tolist()) == ([[0.5, 1]], [0.5])
 
 
+CHILD = revolute("a", body="A", inner=revolute("b", pos="1 0 0", body="B", inner=TIP))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "expected"),
+    [("1 2", [1, 2]), ("9 1 2", [1, 2]), ("1", None), ("1 2 3 4", None)],
+    ids=["of the revolute joints", "of all joints", "too few", "too many"],
+)
+def test_velocity_limits_of_an_arm_on_a_lift(numbers, expected):
+    lift = f'<body name="cart"><joint name="lift" type="slide"/><geom size="1"/>{CHILD}</body>'
+    numeric = f'<custom><numeric name="velocity_limit" data="{numbers}"/></custom>'
+    if expected:
+        assert load_mjcf(model(lift, numeric)).velocity_limit.tolist() == expected
+        return
+    with pytest.raises(ValueError, match="in velocity_limit; expected one for each of 3 joints, or .* the 2 revolute"):
+        load_mjcf(model(lift, numeric))
+
+
+def test_attached_models_keep_their_velocity_limits_and_start_poses(tmp_path):
+    rest = '<custom><numeric name="velocity_limit" data="{0} 2"/></custom>'
+    rest += '<keyframe><key name="home" qpos="0.{0} 0.2"/></keyframe>'
+    for name, number in (("one", 1), ("two", 3)):
+        xml = f'<mujoco><compiler angle="radian"/><worldbody>{CHILD}</worldbody>{rest.format(number)}</mujoco>'
+        (tmp_path / f"{name}.xml").write_text(xml)
+    assets = "".join(f'<model name="{name}" file="{name}.xml"/>' for name in ("one", "two"))
+    attached = "".join(f'<attach model="{name}" body="A" prefix="{name}_"/>' for name in ("one", "two"))
+    (tmp_path / "pair.xml").write_text(
+        f"<mujoco><asset>{assets}</asset><worldbody><frame>{attached}</frame></worldbody></mujoco>"
+    )
+    arm = load_mjcf(tmp_path / "pair.xml", tip=["one_tip", "two_tip"])
+    assert arm.joint_names == ("one_a", "one_b", "two_a", "two_b")
+    assert arm.velocity_limit.tolist() == [1, 2, 3, 2] and arm.home.tolist() == [0.1, 0.2, 0.3, 0.2]
+    (tmp_path / "copy").mkdir()
+    for name, content in copied_files(read_source(tmp_path / "pair.xml"), "pair.xml").items():
+        (tmp_path / "copy" / name).write_bytes(content)
+    copied = load_mjcf(tmp_path / "copy" / "pair.xml", tip=["one_tip", "two_tip"])
+    assert copied.velocity_limit.tolist() == [1, 2, 3, 2]
+
+
 def test_links_of_a_gripper_do_not_close_a_loop():
     finger = '<body name="{0}" pos="0.1 0 0"><joint name="{0}" type="slide"/><geom size="0.01"/></body>'
     coupled = '<equality><joint joint1="l" joint2="r"/><connect body1="l" body2="r" anchor="0 0 0"/></equality>'
@@ -216,7 +243,8 @@ MODELS = {
     "branch": (
         lambda: model(BRANCH),
         {},
-        "the model branches: bodies 'B' and 'C' lead to 1 revolute joints each; name one end with tip=",
+        "the model branches: 2 chains of 2 revolute joints end at 'B', 'C'; name one, as in tip=B, several, as in "
+        r'tip=\[B,C\], or all ends of the model with tip=\["\*"\]$',
     ),
     "slide": (
         lambda: model(revolute("a", body="A", inner=BETWEEN)),
@@ -236,7 +264,7 @@ MODELS = {
     "coupled joints": (
         lambda: toy(TIP, '<equality><joint joint1="a" joint2="b"/></equality>'),
         {},
-        "expected a chain or a tree; .* number 1$",
+        "expected joints that move on their own; 'a' and 'b' of the arm are coupled",
     ),
     "unknown base": (lambda: toy(TIP), {"base": "C"}, "the model has no body 'C'; valid are A, B$"),
     "unknown tip": (

@@ -26,6 +26,7 @@ def test_an_inspection_describes_the_arm(arm_file, tmp_path):
     for text in (
         "ur_like: 6 joints, 7 links",
         "expert panda: 7 joints",
+        "ends at: site 'pinch', named as tools are",
         "6 actuators (6 servos on position)",
         "distal to the tip, fixed; their bodies stay as mass: left (slide), right (slide)",
         "1 equality constraints",
