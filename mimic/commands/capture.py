@@ -19,7 +19,7 @@ from mimic.envs.config import DemonstrationConfig, EnvConfig, ObservationConfig,
 from mimic.metric.kinematics import link_state_table
 from mimic.motions.mocap.arms import find_arms, find_facing, unnamed
 from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
-from mimic.motions.mocap.clips import Windows, relative_speeds, slow_down_for, turned, windows
+from mimic.motions.mocap.clips import Windows, relative_speeds, slow_down_for, slow_down_for_windows, turned, windows
 from mimic.motions.mocap.conventions import segments
 from mimic.motions.mocap.link_motion import BOTH, LinkMotion, arm_motion, rigid_error, sides
 from mimic.motions.mocap.names import parts_of
@@ -28,6 +28,7 @@ from mimic.motions.mocap.points import SIDES, ArmPoints, PointMotion, bridge_gap
 from mimic.motions.mocap.reading import read_motion
 
 MOTION_CAPTURE = (".bvh", ".c3d", ".trc")  # CSV and npz files may be those of joint angles
+_SLOWEST = 20.0  # factor on the times of a short clip
 _RATIO = 0.75, 1.7  # of the lengths of upper arm and forearm of people
 _DIFFERENT = 0.1  # of a length: arms that differ by more are named
 _CHECK = "check the points (capture.shoulder= elbow= wrist=)"
@@ -145,6 +146,9 @@ def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Pa
     parts = capture.parts
     zero = zero_frames(parts[int(np.argmax([len(part.start) for part in parts]))])
     slow_down = capture_config.slow_down or slow_down_for(parts, capture_config.speed, cutoff=capture_config.cutoff)
+    stretched = _slow_down_for_windows(capture, env)
+    if capture_config.slow_down is None and slow_down < stretched <= _SLOWEST:
+        slow_down = stretched  # a short clip
     cut = windows(
         parts, zero, starts=capture.starts, dt=env.control_dt, horizon=env.horizon, slow_down=slow_down,
         overlap=capture_config.overlap, held_out=capture_config.held_out, cutoff=capture_config.cutoff,
@@ -204,10 +208,17 @@ def prepare_capture_inspection(source: Path, config: CaptureConfig, out: Path | 
         for side in [*find_arms(body), *both]:
             out_file = f"{source.stem}_{side.split()[0]}.npz"
             words = [setting("source", str(source)), *(f"arm={side}".split()), setting("out", out_file)]
-            command = f"python -m mimic.demonstrations {shell_words(words)}"
+            command = f"python -m mimic.demonstrations {shell_words([*words, *_changed(config)])}"
             console.print(f"demonstrations: {command}", soft_wrap=True, highlight=False, markup=False)
 
     return run
+
+
+def _changed(config: CaptureConfig) -> list[str]:
+    """The keys of a capture that are not the default ones, as words of a command."""
+    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    default = CaptureConfig()
+    return [setting(f"capture.{name}", value) for name, value in values.items() if value != getattr(default, name)]
 
 
 def body_lines(body: PointMotion) -> list[str]:
@@ -256,15 +267,21 @@ def _capture_lines(capture: Capture, cut: Windows, env: EnvConfig) -> list[str]:
     part = max(capture.parts, key=lambda part: len(part.start))
     lengths = ", ".join(f"{name} {length:.3f} m" for name, length in zip(part.names, part.link_lengths, strict=True))
     fastest = max(relative_speeds(part).max() for part in capture.parts) / cut.slow_down
+    short = ", so that two windows fit" if cut.slow_down == _slow_down_for_windows(capture, env) else ""
     lines = [
         f"links: {lengths}; as rigid links they differ from the points by {1000 * rigid_error(part):.1f} mm",
-        f"time: {cut.slow_down:.2f} times as long as captured; the fastest link then turns at {fastest:.2f} rad/s",
+        f"time: {cut.slow_down:.2f} times as long as captured{short} (capture.slow_down= sets it); the fastest link "
+        f"then turns at {fastest:.2f} rad/s",
         f"windows of {env.horizon} steps of {env.control_dt:g} s: {cut.training} for training, the last "
         f"{cut.held_out} in time held out",
     ]
     if capture.bridged or len(capture.parts) > 1:
         lines.insert(0, f"gaps bridged: {capture.bridged}; parts without longer gaps or jumps: {len(capture.parts)}")
     return lines
+
+
+def _slow_down_for_windows(capture: Capture, env: EnvConfig) -> float:
+    return slow_down_for_windows(capture.parts, env.horizon * env.control_dt)
 
 
 def _between(cuts: np.ndarray, length: int) -> list[tuple[int, int]]:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.arms.link_match import LinkMatch
 from mimic.arms.pose_limits import pose_limits
 from mimic.commands.config import RenderConfig
@@ -99,7 +100,7 @@ def prepare_clip(config: RenderConfig) -> ClipPlan:
 def _policy_clip(config: RenderConfig) -> ClipPlan:
     """A policy's rollout, with the kinematic bound and the distance of holding the start pose."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
-    _check_unused(config, "a run of trainer=ppo", "demonstrations", "limits", "seed")
+    _check_unused(config, "a run of trainer=ppo", "demonstrations", "expert", "limits", "seed")
     trained, trainer = make_policy_trainer(trained, run_dir, config.learner, config.locked)
     index = demonstration_index(trainer.evaluator, config.split, config.demonstration)
     _, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
@@ -128,7 +129,7 @@ def _policy_clip(config: RenderConfig) -> ClipPlan:
 
 def _mapper_clip(config: RenderConfig) -> ClipPlan:
     """A demonstration of the expert, and the pose of the pose mapper at each frame."""
-    _check_unused(config, "a run of trainer=pose_mapper", "split", "learner", "locked", "limits")
+    _check_unused(config, "a run of trainer=pose_mapper", "split", "learner", "locked", "expert", "limits")
     run_dir = Path(config.run).expanduser()
     env = one_learner(load_config(run_dir).env)
     mapper = load_mapper(run_dir, config.checkpoint)
@@ -167,7 +168,8 @@ def _retargeted_clip(config: RenderConfig) -> ClipPlan:
     for key, example in (("demonstrations", "EXPERT.npz"), ("retargeted", "LEARNER.npz"), ("learner", "panda4dof")):
         if not getattr(config, key):
             raise ValueError(f"{key}: expected with retargeted=FILE, as in {key}={example}")
-    env = env_config(config.learner, limits=config.limits)
+    expert_model = {"expert": {"model": config.expert, "tip": [ALL_ENDS]}} if config.expert else {}
+    env = env_config(config.learner, limits=config.limits, **expert_model)
     expert, learner = env.build_arms().embodiments
     demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
     motions = load_demonstrations(Path(config.retargeted).expanduser())

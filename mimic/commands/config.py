@@ -126,6 +126,7 @@ class RenderConfig:
       learner: name of the environment that `retargeted` was computed for; of a run of many arms, name or file of the
         one that its policy moves.
       locked: numbers or names of the joints of this arm that are locked.
+      expert: model of the arm in `demonstrations`, as of a captured person. Default "": the environment's expert.
       limits: the `limits` that `retargeted` was computed with, see `EnvConfig`.
       out: video file. Default "": a file in the folder `videos` of the run directory.
       compilation_cache: see `TrainConfig`.
@@ -140,6 +141,7 @@ class RenderConfig:
     retargeted: str = ""
     learner: str = ""
     locked: list[Any] = dataclasses.field(default_factory=list)
+    expert: str = ""
     limits: str = "none"
     out: str = ""
     compilation_cache: str = "~/.cache/mimic/jax"

@@ -15,7 +15,7 @@ from rich.table import Table
 from mimic.arms.arm import finite_velocity_limit
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
-from mimic.arms.pose_limits import continuous_joints
+from mimic.arms.pose_limits import continuous_joints, pose_limits
 from mimic.base.config import new_file
 from mimic.commands.config import RetargetConfig
 from mimic.evaluation.rollout_metrics import pose_similarity
@@ -64,7 +64,7 @@ def retarget(
     Raises:
       ValueError: the demonstrations belong to another arm or leave its joint range, or the mapper is for other arms.
     """
-    _check(demonstrations, expert)
+    check_poses(demonstrations, expert)
     jump = largest_jump(learner, demonstrations.dt)
     expert_qpos = jnp.asarray(demonstrations.qpos, jnp.float32)
     if mapper is None:
@@ -163,7 +163,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
     env = config.resolve()
     expert, learner = env.build_arms().embodiments
     demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
-    _check(demonstrations, expert)
+    check_poses(demonstrations, expert)
     capsules = fit_capsules(env.learner, env.limits) if config.costs.of_capsules else None
     mapper = None
     if config.mapper:
@@ -183,10 +183,13 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
     return run
 
 
-def _check(demonstrations: Demonstrations, arm: Embodiment) -> None:
-    """Raises a `ValueError` for demonstrations of another arm, and for poses outside its joint range."""
+def check_poses(demonstrations: Demonstrations, arm: Embodiment) -> None:
+    """Raises a `ValueError` for demonstrations of another arm, and for poses outside its joint range.
+
+    Joints that turn freely have none.
+    """
     demonstrations.check_fits(arm, demonstrations.dt, demonstrations.horizon)
-    lower, upper = np.asarray(arm.joint_range).T
+    lower, upper = pose_limits(arm, float)
     outside = (demonstrations.qpos < lower - 1e-6) | (demonstrations.qpos > upper + 1e-6)
     if outside.any():
         demonstration, sample, joint = np.argwhere(outside)[0]

@@ -1,15 +1,19 @@
 """From a clip to demonstrations: `python -m mimic.demonstrations source=CLIP`, and the inspection of clips."""
 
+import dataclasses
 import shlex
 
 import numpy as np
 import pytest
 
 import mimic
-from mimic.commands.capture import read_arm
+from mimic.commands.capture import body_lines, read_arm, read_body
 from mimic.commands.config import CaptureConfig
-from mimic.motions.mocap.clips import slow_down_for
+from mimic.commands.retarget import check_poses
+from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
+from mimic.motions.mocap.clips import slow_down_for, windows
 from mimic.motions.mocap.link_motion import arm_motion
+from mimic.motions.mocap.picture import draw_skeleton
 from tests.helpers.bodies import bvh_text, person
 from tests.helpers.commands import compose, run
 
@@ -122,6 +126,42 @@ def test_inspect_shows_what_a_clip_has(clip, tmp_path):
     assert commands[-1].env == mimic.env_config("bimanual")
 
 
+def test_a_body_that_was_never_seen_whole_is_drawn(tmp_path):
+    body = person(20)
+    positions = body.positions.copy()
+    positions[:, body.names.index("Head")] = np.nan
+    draw_skeleton(dataclasses.replace(body, positions=positions), tmp_path / "skeleton.png", "person")
+    assert (tmp_path / "skeleton.png").stat().st_size > 10_000
+
+
+def test_angles_of_a_person_beyond_pi_are_retargeted(clip, tmp_path):
+    """The joints of a person turn freely; those of a robot with limits do not."""
+    capture = read_arm(clip, "right", CaptureConfig(trunk=0.0))
+    zero = zero_frames(capture.parts[0])
+    (tmp_path / "person.xml").write_text(ball_chain_xml(capture.parts[0], zero))
+    arm = mimic.load_mjcf(tmp_path / "person.xml")
+    cut = windows(capture.parts, zero, starts=capture.starts, dt=0.1, horizon=3).demonstrations
+    wound = dataclasses.replace(cut, qpos=cut.qpos + 2 * np.pi, arm=arm.name)
+    check_poses(wound, arm)
+    with pytest.raises(ValueError, match="outside its range"):
+        check_poses(wound, dataclasses.replace(arm, joint_range=0.5 * np.asarray(arm.joint_range)))
+
+
+def test_what_is_unusual_about_arms_is_named(tmp_path):
+    body = person(60)
+    positions = body.positions.copy()
+    hand, elbow = (positions[:, body.names.index(name)] for name in ("RightHand", "RightForeArm"))
+    hand[:] = elbow + 0.4 * (hand - elbow)
+    np.savez(tmp_path / "clip.npz", names=np.array(body.names), positions=positions, rate=body.rate, unit=np.array("m"))
+    lines = body_lines(read_body(tmp_path / "clip.npz", CaptureConfig()))
+    assert any(line.startswith("right arm: an upper arm of 0.28 m and a forearm of 0.10 m") for line in lines)
+    assert any(line.startswith("arms of 0.53 m (left) and 0.38 m (right)") for line in lines)
+    named = CaptureConfig(shoulder="RightArm", elbow="RightForeArm", wrist="RightHand+RightHandMiddle1")
+    assert "right arm: RightArm - RightForeArm - RightHand+RightHandMiddle1" in " ".join(
+        body_lines(read_body(tmp_path / "clip.npz", named))
+    )
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -130,6 +170,9 @@ def test_inspect_shows_what_a_clip_has(clip, tmp_path):
         (("count=3",), "count: expected none with source=FILE"),
         (("env.horizon=9000",), "expected a motion without gaps of"),
         (("capture.overlap=1",), "capture.overlap"),
+        (("capture.subject=Bob",), "subject: expected one of 'Hips', got 'Bob'"),
+        (("capture.wrist=p9",), "point: expected one of Hips"),
+        (("arm=both", "capture.wrist=RightHand"), "expected with arm=left or arm=right, got arm=both"),
     ],
 )
 def test_bad_input_is_one_line(reason, clip, arguments, message):

@@ -19,6 +19,8 @@ from mimic.commands.render import _write_video, draw_frames, prepare_video
 from mimic.envs import env_config
 from mimic.metric.similarity import centre_line, similarity
 from mimic.motions.demonstrations import Demonstrations
+from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
+from mimic.motions.mocap.link_motion import LinkMotion
 from mimic.motions.recording import record_demonstrations
 from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
@@ -156,6 +158,28 @@ def test_bad_files_are_rejected_in_one_line(files, changes, message):
     with pytest.raises(ValueError, match=message) as error:
         prepare_video(RenderConfig(**{**files, **changes}))
     assert "\n" not in str(error.value)
+
+
+def test_motions_of_an_expert_from_a_file(files, tmp_path):
+    """As a person's: the environment's expert does not count."""
+    expert = mimic.env_config("planar4dof").build_arms().expert.embodiment
+    motion = LinkMotion(("a", "b"), (-1, 0), *_moving_links(), 10.0, "person")
+    (tmp_path / "person.xml").write_text(ball_chain_xml(motion, zero_frames(motion)))
+    person = mimic.load_mjcf(tmp_path / "person.xml")
+    assert person.num_joints == 6 != expert.num_joints
+    swings(person).save(tmp_path / "person.npz")
+    changed = {**files, "demonstrations": str(tmp_path / "person.npz")}
+    with pytest.raises(ValueError, match="demonstrations: expected motions of planar"):
+        prepare_clip(RenderConfig(**changed))
+    plan = prepare_clip(RenderConfig(**changed, expert=str(tmp_path / "person.xml")))
+    assert plan.env.build_arms().expert.embodiment.joint_names == person.joint_names
+
+
+def _moving_links():
+    """Start and end of two links over time."""
+    points = np.cumsum([[0, 0, 0], [0.3, 0, 0], [0.2, 0.1, 0]], axis=0) + np.zeros((5, 1, 1))
+    points[:, 2, 2] = 0.02 * np.arange(5)
+    return points[:, :-1], points[:, 1:]
 
 
 def test_motions_of_another_length_are_rejected(files, tmp_path):

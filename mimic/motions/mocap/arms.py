@@ -76,7 +76,7 @@ def unnamed(motion: PointMotion) -> str:
 def _by_side(named: _Named) -> dict[str, dict[int, Part]]:
     sides = {side: {i: part for i, part in named.items() if part.side == side} for side in SIDES}
     elbows = [part for part in named.values() if part.part in ("elbow", "forearm")]
-    prefixes = {part.prefix for part in elbows}
+    prefixes = {part.prefix for part in elbows}  # with several, these may be persons or sides
     if not any(part.side for part in elbows) and len(prefixes) == 1:
         own = {i: part for i, part in named.items() if not part.side and part.prefix in prefixes}
         sides["right"] |= {i: part._replace(side="right") for i, part in own.items()}

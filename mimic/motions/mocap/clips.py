@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -90,11 +91,11 @@ def windows(
             rows.append((_principal(angles(times)), angles(times, 1) / slow_down))
             begins.append(start + first)
     training, chosen = _split(np.array(begins), length, held_out)
-    if not training or len(chosen) == training:
+    if not training:
         longest = max((len(part.start) - 1) / part.rate for part in parts)
         raise ValueError(
-            f"source: expected a motion without gaps of {2 * length:.3g} s at least, for a window to train on and one "
-            f"to hold out, got {longest:.3g} s"
+            f"source: expected a motion without gaps of {2 * length:.4g} s at least, for a window to train on and one "
+            f"to hold out, got {longest:.4g} s; capture.slow_down= and env.horizon= set the length of a window"
         )
     qpos, qvel = (np.stack([rows[i][column] for i in chosen]) for column in (0, 1))
     names = tuple(f"{name}_{axis}" for name in parts[0].names for axis in AXES)
@@ -103,13 +104,19 @@ def windows(
 
 
 def _split(begins: np.ndarray, length: float, held_out: float) -> tuple[int, list[int]]:
-    """Number of training windows, and the indices of these and of the held-out ones."""
-    if not len(begins):
-        return 0, []
-    count = max(1, round(held_out * len(begins)))
-    first_held_out = begins[-count]
-    training = [i for i in range(len(begins)) if begins[i] + length <= first_held_out + 1e-9]
-    return len(training), [*training, *range(len(begins) - count, len(begins))]
+    """Number of training windows, and the indices of these and of the held-out ones, of which one is enough."""
+    for count in range(max(1, round(held_out * len(begins))), 0, -1):
+        training = np.flatnonzero(begins + length <= begins[-count:][:1] + 1e-9)
+        if len(training):
+            return len(training), [*training, *range(len(begins) - count, len(begins))]
+    return 0, []
+
+
+def slow_down_for_windows(parts: Sequence[LinkMotion], seconds: float) -> float:
+    """Factor on times with which two windows [s] fit, one to train on and one to hold out; infinite where none does."""
+    durations = sorted(((len(part.start) - 1) / part.rate for part in parts if len(part.start) >= 4), reverse=True)
+    longest = max([0.0, *(duration / 2 for duration in durations[:1]), *durations[1:2]])
+    return seconds / longest * (1 + 1e-9) if longest else math.inf
 
 
 def _principal(qpos: np.ndarray) -> np.ndarray:

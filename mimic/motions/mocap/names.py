@@ -166,7 +166,7 @@ def _known_ending(words: list[str], has_side: bool) -> Part | None:
     for stop in range(len(words), 0, -1):
         for first in range(stop):
             joined = "".join(words[first:stop])
-            if any(word in _KNOWN for word in words[:first]) or (first and len(joined) < _SHORTEST):
+            if any(any(_readings(word, has_side)) for word in words[:first]) or (first and len(joined) < _SHORTEST):
                 break
             for side, (part, rank, own_place) in _readings(joined, has_side):
                 return Part(" ".join(words[:first]), side, part, rank, place or own_place, number)

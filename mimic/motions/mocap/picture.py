@@ -17,13 +17,18 @@ _POSES = 5
 
 
 def draw_skeleton(motion: PointMotion, path: Path, title: str) -> None:
-    """Five poses of a body side by side, seen from the front and from the left, with its arms in colour."""
-    whole = np.isfinite(motion.positions).all(axis=(1, 2))
-    samples = np.flatnonzero(whole)[np.linspace(0, whole.sum() - 1, _POSES).round().astype(int)]
+    """Five poses of a body side by side, seen from the front and from the left, with its arms in colour.
+
+    They are at times at which most points were seen.
+    """
+    seen = np.isfinite(motion.positions).all(axis=2).sum(axis=1)
+    most = np.flatnonzero(seen == seen.max())
+    samples = most[np.linspace(0, len(most) - 1, _POSES).round().astype(int)]
     figure, axes = plt.subplots(2, _POSES, figsize=(1.9 * _POSES, 7), sharey=True)
     arms = find_arms(motion)
-    centred = motion.positions[samples] - motion.positions[samples].mean(axis=1, keepdims=True) * [1, 1, 0]
-    reach = 1.1 * float(np.abs(centred[..., :2]).max())
+    middle = np.nanmean(motion.positions[samples], axis=1, keepdims=True) * [1, 1, 0]
+    centred = motion.positions[samples] - middle
+    reach = 1.1 * float(np.nanmax(np.abs(centred[..., :2])))
     for column, sample in enumerate(samples):
         pose = centred[column]
         for row, (horizontal, label) in enumerate(((1, "y [m]"), (0, "x [m]"))):
@@ -35,7 +40,7 @@ def draw_skeleton(motion: PointMotion, path: Path, title: str) -> None:
             for side, arm in arms.items():
                 groups = [group for group in (arm.shoulder, arm.elbow, arm.wrist, arm.hand) if group]
                 line = np.stack([mean_point(motion, group)[sample] for group in groups])
-                line -= motion.positions[sample].mean(axis=0) * [1, 1, 0]
+                line -= middle[column]
                 axis.plot(line[:, horizontal], line[:, 2], "o-", color=_COLOURS[side], markersize=3, label=side)
             axis.set_aspect("equal")
             axis.set_xlim(-reach, reach)

@@ -8,7 +8,7 @@ import pytest
 import mimic
 from mimic.metric.kinematics import link_state_table
 from mimic.motions.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
-from mimic.motions.mocap.clips import relative_speeds, slow_down_for, turned, windows
+from mimic.motions.mocap.clips import relative_speeds, slow_down_for, slow_down_for_windows, turned, windows
 from mimic.motions.mocap.link_motion import LinkMotion, arm_motion, low_pass, motion_states, rigid_error
 from mimic.motions.mocap.points import bridge_gaps, gaps, jumps
 from tests.helpers.bodies import RATE, person
@@ -140,6 +140,17 @@ def test_windows_do_not_cross_from_training_to_held_out(right_arm):
         windows([right_arm.cut(0, 40)], zero, starts=[0.0], dt=0.1, horizon=50)
 
 
+@pytest.mark.parametrize("seconds", [0.7, 1.5, 5.0])
+def test_a_short_motion_is_slowed_down_until_two_windows_fit(right_arm, seconds):
+    short = right_arm.cut(0, int(seconds * RATE) + 1)
+    slow_down = slow_down_for_windows([short], 5.0)
+    assert slow_down == pytest.approx(10 / seconds)
+    cut = windows([short], zero_frames(short), starts=[0.0], dt=0.1, horizon=50, slow_down=slow_down)
+    assert (cut.training, cut.held_out) == (1, 1)
+    assert slow_down_for_windows([short, short], 5.0) == pytest.approx(5 / seconds)  # one in each
+    assert slow_down_for_windows([short.cut(0, 2)], 5.0) == np.inf
+
+
 def test_short_gaps_are_bridged_and_long_ones_split(body):
     positions = body.positions.copy()
     positions[100:110, 11] = np.nan  # 0.17 s
@@ -175,3 +186,11 @@ def test_what_is_no_motion_is_rejected(right_arm):
         dataclasses.replace(right_arm, end=right_arm.start)
     with pytest.raises(ValueError, match="expected an earlier link"):
         dataclasses.replace(right_arm, parents=(-1, 1, 0))
+
+
+def test_a_first_frame_in_another_pose_is_a_jump(body):
+    """At 30 Hz 0.4 m in one sample are slower than a hand can be, but no hand is as fast in that sample alone."""
+    slow = dataclasses.replace(body, positions=body.positions[::2].copy(), rate=RATE / 2)
+    assert len(jumps(slow)) == 0
+    slow.positions[0] += [0.0, 0.0, 0.4]
+    assert jumps(slow).tolist() == [1]
