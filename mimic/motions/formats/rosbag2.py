@@ -33,7 +33,7 @@ _FIELD = {ANGLE: "position", VELOCITY: "velocity", TORQUE: "effort"}  # of a mes
 _MAX_BAGS = 100_000
 _FLOATS_OF_JOINT = 3  # in a message
 _DISTINCT = 0.3  # least fraction of stamps that differ, of those of a clock: some messages are published twice
-_RESET = 10**9  # ns, a step back of a clock that starts anew; messages of several publishers arrive late by less
+_RESET = 5 * 10**8  # ns, a step back of a clock that starts anew; messages of several publishers arrive late by less
 
 
 def write_rosbag2(folder: Path, episodes: Episodes) -> None:

@@ -2,6 +2,7 @@
 
 import gzip
 import re
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -121,7 +122,7 @@ def _read_cells(path: Path) -> tuple[list[str], np.ndarray]:
                 header = []
         cells = [[_number(cell, separator) for cell in _cells(row, separator)] for row in rows]
         return header, np.array(cells, float).reshape(len(rows), len(header) or -1)
-    except (OSError, EOFError, ValueError) as error:
+    except (OSError, EOFError, ValueError, zlib.error) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"source: {str(path)!r} is no table of numbers below a header: {reason}") from error
 

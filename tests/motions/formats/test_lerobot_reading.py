@@ -53,7 +53,9 @@ def foreign(folder, *, names, version="v3.0", fps=20, **columns):
     return folder, state.reshape(2, STEPS, 2)
 
 
-@pytest.mark.parametrize("names", [["b", "a"], ["b.pos", "a.pos"], {"motors": ["b", "a"]}])
+@pytest.mark.parametrize(
+    "names", [["b", "a"], ["b.pos", "a.pos"], {"motors": ["b", "a"]}, [["b", "a"]], {"b": 0, "a": 1}]
+)
 def test_datasets_of_others_are_read(tmp_path, names):
     folder, state = foreign(tmp_path / "set", names=names)
     first, second = read_lerobot(folder, ["a", "b"]).motions.values()
@@ -61,6 +63,22 @@ def test_datasets_of_others_are_read(tmp_path, names):
     np.testing.assert_array_equal(second.qpos, state[1][:, ::-1])
     np.testing.assert_allclose(second.time, np.arange(STEPS) / 20, atol=1e-12)  # exact multiples
     assert first.qvel is None
+
+
+def test_datasets_of_version_2_have_a_file_for_each_episode(tmp_path):
+    """Without names of the columns: the joints in their order, then the gripper."""
+    folder, state = foreign(tmp_path / "set", names=None, version="v2.1")
+    (file,) = (folder / "data/chunk-000").iterdir()
+    table = pq.read_table(file)
+    for episode in (4, 7):
+        rows = table.filter(pa.compute.equal(table["episode_index"], episode))
+        pq.write_table(rows, file.with_name(f"episode_{episode:06d}.parquet"))
+    file.unlink()
+    recording = read_lerobot(folder, ["elbow"])
+    assert list(recording.motions) == ["episode 4", "episode 7"] and recording.gripper == ("2",)
+    np.testing.assert_array_equal(recording.motions["episode 7"].qpos, state[1][:, :1])
+    np.testing.assert_array_equal(recording.motions["episode 7"].gripper, state[1][:, 1:])
+    assert recording.notes == ("joints: 1, found by their order; joints=[...] names others",)
 
 
 def test_recorded_times_are_kept(tmp_path):
