@@ -1,5 +1,6 @@
 """`python -m mimic.demonstrations`: records an expert or imports motions, and compares them with the arm's limits."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -69,7 +70,7 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
     """Imports motions; the returned function writes and plots them."""
     _check_unused(config, "kind", "count", "seed")
     source = Path(config.source).expanduser()
-    model = arm if env.limits == "hardware" else build_arm(env.expert, "hardware")
+    model = arm if env.limits == "hardware" else build_arm(dataclasses.replace(env.expert, home=None), "hardware")
     imported, notes = import_demonstrations(
         source,
         arm.embodiment,

@@ -19,6 +19,8 @@ OVERSHOOT = 0.02  # rad, 1 degree: how far measured angles may lie beyond a join
 # 100 rad/s^2, several times what arms reach, and that the samples before and after do not continue.
 _JUMP, _MAX_ACCELERATION = 0.15, 100.0
 _GAP, _GAP_SAMPLES, _GAP_MOTION = 0.5, 5.0, 0.05  # s, median intervals, rad: no samples for longer, while a joint moved
+_LATE, _MOST_LATE = 0.1, 0.1  # s, fraction: samples that arrive out of order are few and late by less
+_DOUBLED = 0.01  # of the usual interval: equal samples within it are one that was published twice
 _DISAGREEMENT, _SPEED_NOISE = 0.5, 0.05  # of stated and true velocities: relative RMS, and rad/s
 
 
@@ -85,18 +87,31 @@ def _finite(name: str, motion: Motion, notes: Notes) -> Motion:
 
 
 def _forward_parts(name: str, motion: Motion, notes: Notes) -> list[Motion]:
-    """The parts between steps back in time, each without repeated times."""
+    """The parts between steps back in time, each without repeated samples."""
+    interval = np.diff(motion.time)
+    late = (interval < 0) & (interval > -_LATE)
+    if 0 < np.sum(late) < _MOST_LATE * len(interval):
+        notes.add("samples put in the order of their times", f"{np.sum(late)} of {len(interval)} in {name}")
+        motion = motion.take(_in_order(motion.time))
     back = np.flatnonzero(np.diff(motion.time) < 0)
     if len(back):
         notes.add("split where time steps back", f"{name}, {len(back)} times, first after {motion.time[back[0]]:g} s")
     parts = []
     for rows in np.split(np.arange(len(motion.time)), back + 1):
         part = motion.take(rows)
-        new = np.concatenate([[True], np.diff(part.time) > 0])
+        interval, is_same = np.diff(part.time), np.all(np.diff(part.qpos, axis=0) == 0, axis=1)
+        usual = float(np.percentile(interval, 75)) if len(interval) else 0.0  # of each other one where all are doubled
+        new = np.concatenate([[True], (interval > 0) & ~(is_same & (interval < _DOUBLED * usual))])
         if not new.all():
-            notes.add("samples at repeated times left out", f"{np.sum(~new)} of {len(new)} in {name}")
+            notes.add("repeated samples left out", f"{np.sum(~new)} of {len(new)} in {name}")
         parts.append(part.take(new))
     return parts
+
+
+def _in_order(time: np.ndarray) -> np.ndarray:
+    """Indices that sort samples between steps back in time of more than `_LATE`."""
+    restarts = np.concatenate([[0], np.cumsum(np.diff(time) <= -_LATE)])
+    return np.lexsort((time, restarts))
 
 
 def _without_jumps(name: str, motion: Motion, joint_names: Sequence[str], notes: Notes) -> Iterator[Motion]:

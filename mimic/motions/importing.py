@@ -83,6 +83,8 @@ def import_demonstrations(
             f"windows of {duration:g} s: {len(windows)}, of {len(recording.motions) - len(short)} motions{left}"
         )
     demonstrations = _demonstrations(windows, arm, dt, recording.gripper)
+    if recording.gripper and demonstrations.gripper is None:
+        notes.append(f"gripper left out, since some motions have no values of {', '.join(recording.gripper)}")
     return _within_velocity_limits(demonstrations, arm, notes), notes
 
 
@@ -194,17 +196,25 @@ def _windows(motion: Motion, starts: np.ndarray, dt: float, horizon: int) -> lis
     time = motion.time[0] + starts[:, None] + dt * np.arange(horizon + 1)
     time = np.minimum(time, motion.time[-1]).ravel()  # rounding must not extrapolate
     qpos, qvel = angles_and_velocities(motion, time, dt)
-    gripper = None
-    if motion.gripper is not None:
-        gripper = np.stack([np.interp(time, motion.time, channel) for channel in motion.gripper.T], axis=1)
-    resampled = Motion(time, qpos, qvel, gripper)
+    resampled = Motion(time, qpos, qvel, _resampled_gripper(motion, time))
     return [resampled.take(slice(row, row + horizon + 1)) for row in range(0, len(time), horizon + 1)]
+
+
+def _resampled_gripper(motion: Motion, time: np.ndarray) -> np.ndarray | None:
+    """The gripper at any times, linear between samples that are numbers; None where a channel has none."""
+    if motion.gripper is None or not np.isfinite(motion.gripper).any(axis=0).all():
+        return None
+    channels = []
+    for channel in motion.gripper.T:
+        known = np.isfinite(channel)
+        channels.append(np.interp(time, motion.time[known], channel[known]))
+    return np.stack(channels, axis=1)
 
 
 def _demonstrations(windows: list[Motion], arm: Embodiment, dt: float, gripper: tuple[str, ...]) -> Demonstrations:
     qpos, qvel = (np.stack([getattr(window, field) for window in windows]) for field in ("qpos", "qvel"))
     channels = [window.gripper for window in windows if window.gripper is not None]
-    opening = np.stack(channels) if len(channels) == len(windows) else None
+    opening = np.stack(channels) if len(channels) == len(windows) else None  # type: ignore[arg-type]
     return Demonstrations(
         qpos, qvel, qpos[:, -1], float(dt), arm.name, arm.joint_names,
         gripper=opening, gripper_names=gripper if opening is not None else (),

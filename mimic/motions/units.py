@@ -26,7 +26,7 @@ def find_unit(
 ) -> tuple[str, str]:
     """The unit of a recording's angles, and a line that says how it is known; empty where it is what a source states.
 
-    Stated units count. Sources of which other units than rad are unusual are in rad. Others are in the only unit in
+    Stated units count. Sources for which other units than rad are unusual are in rad. Others are in the only unit in
     which their values are angles of this arm and motions of more than 2 degrees.
 
     Args:
@@ -42,8 +42,10 @@ def find_unit(
     if units:
         check_choice("units", units, UNITS)
         return units, ""
-    if recording.unit or recording.robot is None:
-        return recording.unit or "rad", ""
+    if recording.unit:
+        return recording.unit, ""
+    if recording.robot is None:
+        return "rad", "units: rad, as is usual for such sources; units= states others"
     low, high = (extreme([extreme(motion.qpos, axis=0) for motion in recording.motions.values()], axis=0)
                  for extreme in (np.nanmin, np.nanmax))  # fmt: skip
     fitting = {unit: line for unit in UNITS if (line := _fit(unit, low, high, joint_range, recording))}

@@ -99,7 +99,7 @@ def test_repeated_times_missing_samples_and_restarts_are_told():
     motion = swing().take(np.repeat(np.arange(len(TIME)), 2))
     (once,), (line,) = clean(motion)
     np.testing.assert_array_equal(once.time, TIME)
-    assert line == "samples at repeated times left out: 300 of 600 in swing"
+    assert line == "repeated samples left out: 300 of 600 in swing"
     motion = swing()
     motion.qpos[7, 1] = np.nan
     (rest,), (line,) = clean(motion)
@@ -108,6 +108,18 @@ def test_repeated_times_missing_samples_and_restarts_are_told():
     assert len(parts) == 2 and line.startswith("split where time steps back: swing, 1 times")
     with pytest.raises(ValueError, match="two or more samples at times that increase"):
         clean(swing().take(slice(None, None, -1)))
+
+
+def test_samples_out_of_order_and_doubled_ones_a_moment_later_are_repaired():
+    order = np.arange(len(TIME))
+    order[[50, 51]] = 51, 50
+    (motion,), (line,) = clean(swing().take(order))
+    np.testing.assert_array_equal(motion.time, TIME)
+    assert line == "samples put in the order of their times: 1 of 299 in swing"
+    twice = swing().take(np.repeat(np.arange(len(TIME)), 2))
+    twice.time[1::2] += 1e-6
+    (once,), _ = clean(twice)
+    np.testing.assert_array_equal(once.time, TIME)
 
 
 @pytest.mark.parametrize("factor", [0.0, np.nan, 180 / np.pi, -1.0])

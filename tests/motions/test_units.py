@@ -35,7 +35,7 @@ def recording(low, high, robot="", unit=""):
 def test_the_only_unit_that_fits_is_found(low, high, robot, expected):
     unit, line = find_unit("set", recording(low, high, robot), NAMES, RANGE, "")
     assert unit == expected
-    assert (f"units: {expected}, found from" in line) == (robot is not None)
+    assert f"units: {expected}, {'as is usual' if robot is None else 'found from'}" in line
 
 
 @pytest.mark.parametrize(

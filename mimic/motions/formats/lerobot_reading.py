@@ -69,9 +69,11 @@ def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> Record
     order = np.lexsort((frame, episode))
     numbers, starts = np.unique(episode[order], return_index=True)
     final = _final_values(path, selection.entry)
-    motions = {}
+    motions, notes = {}, list(selection.notes)
     for number, rows in zip(numbers, np.split(order, starts[1:]), strict=True):
-        times, samples, gripper = _times(frame[rows], time[rows], fps), values[rows], of_gripper[rows]
+        times, line = _times(frame[rows], time[rows], fps)
+        notes += [line] if line and line not in notes else []
+        samples, gripper = values[rows], of_gripper[rows]
         if int(number) in final:
             times, samples = np.append(times, times[-1] + 1 / fps), np.vstack([samples, final[int(number)]])
             gripper = samples if beside == selection.entry else np.vstack([gripper, gripper[-1:]])
@@ -80,7 +82,7 @@ def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> Record
         opening = _select(gripper, features[beside].columns[ANGLE], selection.gripper) if selection.gripper else None
         motions[f"episode {number}"] = Motion(times, qpos, qvel, opening)
     robot = str(info.get("robot_type") or "")
-    return Recording(motions, tuple(selection.gripper), chosen.unit, robot, tuple(selection.notes))
+    return Recording(motions, tuple(selection.gripper), chosen.unit, robot, tuple(notes))
 
 
 def _check_info(info: Mapping[str, Any]) -> float:
@@ -129,10 +131,14 @@ def _select(samples: np.ndarray, columns: Mapping[str, int], joints: Sequence[st
     return samples[:, [columns[joint] for joint in joints]] if set(joints) <= set(columns) else None
 
 
-def _times(frame: np.ndarray, timestamp: np.ndarray, fps: float) -> np.ndarray:
-    """Times of frames [s]: the exact multiples of 1 / fps that timestamps round, or else the timestamps."""
+def _times(frame: np.ndarray, timestamp: np.ndarray, fps: float) -> tuple[np.ndarray, str]:
+    """Times of frames [s]: the exact multiples of 1 / fps that timestamps round, or else the timestamps; and a line."""
     exact = frame / fps
-    return exact if np.allclose(timestamp, exact, rtol=0, atol=_TIME_TOLERANCE) else timestamp
+    if np.allclose(timestamp, exact, rtol=0, atol=_TIME_TOLERANCE):
+        return exact, ""
+    if len(timestamp) > 1 and not np.any(np.diff(timestamp) > 0):
+        return exact, f"times: {fps:g} frames a second, since the timestamps do not increase"
+    return timestamp, f"times: the timestamps, which are not those of {fps:g} frames a second"
 
 
 def _read_frames(path: Path, features: Sequence[str]) -> tuple[np.ndarray, ...]:

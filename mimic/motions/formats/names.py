@@ -144,6 +144,8 @@ def select(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str
     if rule:
         notes.append(f"joints: {', '.join(columns)}, found {rule}; joints=[...] names others")
     gripper, gripper_entry = _gripper(entries, name, columns)
+    if gripper and gripper_entry == name and all(column.isdigit() for column in gripper):
+        notes.append(f"gripper: {', '.join(gripper)}, after the joints")
     return Selection(name, columns, gripper, gripper_entry, notes)
 
 

@@ -120,11 +120,18 @@ def _read_cells(path: Path) -> tuple[list[str], np.ndarray]:
             header, rows = _cells(comments[-1], separator) if comments else [], lines
             if _are_numbers(header, separator) or len(header) != len(_cells(lines[0], separator)):
                 header = []
-        cells = [[_number(cell, separator) for cell in _cells(row, separator)] for row in rows]
-        return header, np.array(cells, float).reshape(len(rows), len(header) or -1)
+        return header, _numbers(rows, separator).reshape(len(rows), len(header) or -1)
     except (OSError, EOFError, ValueError, zlib.error) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"source: {str(path)!r} is no table of numbers below a header: {reason}") from error
+
+
+def _numbers(rows: list[str], separator: str | None) -> np.ndarray:
+    """The numbers in rows; the faster way does not know empty cells, quotes and decimal commas."""
+    try:
+        return np.loadtxt(rows, delimiter=separator, comments=None, ndmin=2) if rows else np.zeros((0, 0))
+    except ValueError:
+        return np.array([[_number(cell, separator) for cell in _cells(row, separator)] for row in rows], float)
 
 
 def _text(path: Path) -> str:

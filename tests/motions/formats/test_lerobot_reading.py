@@ -78,7 +78,10 @@ def test_datasets_of_version_2_have_a_file_for_each_episode(tmp_path):
     assert list(recording.motions) == ["episode 4", "episode 7"] and recording.gripper == ("2",)
     np.testing.assert_array_equal(recording.motions["episode 7"].qpos, state[1][:, :1])
     np.testing.assert_array_equal(recording.motions["episode 7"].gripper, state[1][:, 1:])
-    assert recording.notes == ("joints: 1, found by their order; joints=[...] names others",)
+    assert recording.notes == (
+        "joints: 1, found by their order; joints=[...] names others",
+        "gripper: 2, after the joints",
+    )
 
 
 def test_recorded_times_are_kept(tmp_path):
