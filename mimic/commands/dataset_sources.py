@@ -82,4 +82,7 @@ def file_episodes(
 
 
 def _arm_motions(motions: Demonstrations) -> ArmMotions:
-    return ArmMotions(motions.arm, motions.joint_names, motions.qpos, motions.qvel, motions.torque, TORQUE)
+    return ArmMotions(
+        motions.arm, motions.joint_names, motions.qpos, motions.qvel, motions.torque, TORQUE,
+        motions.gripper, motions.gripper_names,
+    )  # fmt: skip

@@ -214,10 +214,11 @@ def _resampled_gripper(motion: Motion, time: np.ndarray) -> np.ndarray | None:
 def _demonstrations(windows: list[Motion], arm: Embodiment, dt: float, gripper: tuple[str, ...]) -> Demonstrations:
     qpos, qvel = (np.stack([getattr(window, field) for window in windows]) for field in ("qpos", "qvel"))
     channels = [window.gripper for window in windows if window.gripper is not None]
+    names = tuple(f"gripper_{name}" if name.isdigit() else name for name in gripper)
     opening = np.stack(channels) if len(channels) == len(windows) else None  # type: ignore[arg-type]
     return Demonstrations(
         qpos, qvel, qpos[:, -1], float(dt), arm.name, arm.joint_names,
-        gripper=opening, gripper_names=gripper if opening is not None else (),
+        gripper=opening, gripper_names=names if opening is not None else (),
     )  # fmt: skip
 
 

@@ -148,6 +148,20 @@ def test_demonstrations_come_back_from_a_dataset(recorded, tmp_path, monkeypatch
     np.testing.assert_allclose(after.qvel, before.qvel, rtol=0, atol=tolerance)
 
 
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_gripper_comes_back_from_a_dataset(recorded, tmp_path, format):
+    before = mimic.load_demonstrations(recorded)
+    opening = 100 * np.random.default_rng(0).random((before.count, before.horizon + 1, 1))
+    path = tmp_path / "gripper.npz"
+    dataclasses.replace(before, torque=None, gripper=opening, gripper_names=("jaw",)).save(path)
+    after, _ = mimic.import_demonstrations(
+        write(tmp_path / "set", demonstrations=str(path), format=format), mimic.panda()
+    )
+    assert after.gripper_names == ("jaw",)
+    np.testing.assert_allclose(after.gripper, opening, atol=1e-5)  # percent in single precision
+    np.testing.assert_allclose(after.qvel, before.qvel, rtol=0, atol=2e-7)
+
+
 @pytest.mark.parametrize(("format", "topic"), [("lerobot", "observation.state"), ("rosbag2", "/learner/joint_states")])
 def test_a_policys_motions_become_demonstrations(run_dir, written, format, topic):
     dataset = written[format]

@@ -8,7 +8,7 @@ import pytest
 
 import mimic
 from mimic.envs.imitation import training_and_held_out
-from mimic.motions.demonstrations import concatenate
+from mimic.motions.demonstrations import concatenate, crossovers
 
 
 def panda():
@@ -155,3 +155,19 @@ def test_the_command_reports_a_damaged_file(reason, tmp_path):
     path = tmp_path / "demonstrations.npz"
     path.write_text("not an archive")
     assert NOT_WHOLE in reason("train", "env=panda4dof", f"env.demonstrations.path={path}")
+
+
+def test_a_gripper_is_kept_with_the_motions(recorded, tmp_path):
+    opening = np.random.default_rng(0).random((recorded.count, recorded.horizon + 1, 2))
+    with_gripper = dataclasses.replace(recorded, gripper=opening, gripper_names=("left", "right"))
+    with_gripper.save(tmp_path / "a.npz")
+    loaded = mimic.load_demonstrations(tmp_path / "a.npz")
+    np.testing.assert_array_equal(loaded.gripper, opening)
+    assert loaded.gripper_names == ("left", "right")
+    np.testing.assert_array_equal(loaded.select([1]).gripper, opening[[1]])
+    np.testing.assert_array_equal(loaded.of_length(3).gripper, opening[:, :4])
+    np.testing.assert_array_equal(concatenate(loaded, loaded).gripper, np.concatenate([opening, opening]))
+    assert concatenate(loaded, recorded).gripper is None and crossovers(loaded, 2, 0).gripper_names == ()
+    dataclasses.replace(with_gripper, gripper=opening[:, 1:]).save(tmp_path / "b.npz")
+    with pytest.raises(ValueError, match="gripper in .* must be"):
+        mimic.load_demonstrations(tmp_path / "b.npz")

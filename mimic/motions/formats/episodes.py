@@ -79,6 +79,8 @@ class ArmMotions:
       qvel: [N, T+1, n] joint velocities [rad/s].
       command: [N, T, n] what was commanded from each sample to the next; None if unknown.
       quantity: what the commands are.
+      gripper: [N, T+1, m] joints or opening of its gripper, in the units of their source; None if unknown.
+      gripper_names: its channels.
     """
 
     arm: str
@@ -87,6 +89,8 @@ class ArmMotions:
     qvel: Float[np.ndarray, "episodes samples joints"]
     command: Float[np.ndarray, "episodes steps joints"] | None = None
     quantity: Quantity = TORQUE
+    gripper: Float[np.ndarray, "episodes samples channels"] | None = None
+    gripper_names: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

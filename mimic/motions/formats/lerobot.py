@@ -97,22 +97,23 @@ def action_of(motions: ArmMotions) -> tuple[np.ndarray, Quantity, str]:
 def _features(episodes: Episodes) -> dict[str, dict[str, Any]]:
     """The columns of the data, as info.json describes them."""
     robot, expert = episodes.robot, episodes.expert
-    features = {STATE: _joint_feature(robot.joint_names, (ANGLE, VELOCITY))}
+    features = {STATE: _joint_feature(robot.joint_names, (ANGLE, VELOCITY), robot.gripper_names)}
     if expert is not None:
         names = [EXPERT + name for name in expert.joint_names]
-        features[EXPERT_STATE] = _joint_feature(names, (ANGLE, VELOCITY))
+        gripper = [EXPERT + name for name in expert.gripper_names]
+        features[EXPERT_STATE] = _joint_feature(names, (ANGLE, VELOCITY), gripper)
     features[ACTION] = _joint_feature(robot.joint_names, (action_of(robot)[1],))
     features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None, "units": ["s"]}
     return features | {name: {"dtype": "int64", "shape": [1], "names": None} for name in _INDICES}
 
 
-def _joint_feature(joints: Sequence[str], quantities: Sequence[Quantity]) -> dict[str, Any]:
-    return {
-        "dtype": "float32",
-        "shape": [len(joints) * len(quantities)],
-        "names": [f"{joint}.{quantity.name}" for quantity in quantities for joint in joints],
-        "units": [quantity.unit for quantity in quantities for _ in joints],  # LeRobot has no place for units
-    }
+def _joint_feature(
+    joints: Sequence[str], quantities: Sequence[Quantity], gripper: Sequence[str] = ()
+) -> dict[str, Any]:
+    names = [f"{joint}.{quantity.name}" for quantity in quantities for joint in joints]
+    names += [f"{name}.{ANGLE.name}" for name in gripper]
+    units = [quantity.unit for quantity in quantities for _ in joints]  # LeRobot has no place for units
+    return {"dtype": "float32", "shape": [len(names)], "names": names, "units": units + [""] * len(gripper)}
 
 
 def _columns(episodes: Episodes, fps: int) -> dict[str, np.ndarray]:
@@ -133,7 +134,8 @@ def _columns(episodes: Episodes, fps: int) -> dict[str, np.ndarray]:
 
 
 def _states(motions: ArmMotions) -> np.ndarray:
-    return np.concatenate([motions.qpos, motions.qvel], axis=-1)
+    parts = [motions.qpos, motions.qvel, *([] if motions.gripper is None else [motions.gripper])]
+    return np.concatenate(parts, axis=-1)
 
 
 def _file_of_episode(lengths: np.ndarray, frame_bytes: int) -> np.ndarray:

@@ -141,6 +141,8 @@ def select(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str
             f"expected one, as topic={' or topic='.join(found)}"
         )
     ((name, (columns, rule)),) = found.items()
+    if is_command(name) and not entry:
+        notes.append(f"{name}: what was commanded, since only it has the joints")
     if rule:
         notes.append(f"joints: {', '.join(columns)}, found {rule}; joints=[...] names others")
     gripper, gripper_entry = _gripper(entries, name, columns)

@@ -61,36 +61,47 @@ def _write_episode(writer: Any, episodes: Episodes, index: int) -> None:
     message_types = {name: store.types[name] for name in (_TYPE, "std_msgs/msg/Header", "builtin_interfaces/msg/Time")}
     joint_state, header, time = message_types.values()
     topics = {
-        topic: (motions, fields, writer.add_connection(topic, _TYPE, typestore=store))
-        for topic, motions, fields in _topics(episodes, index)
+        topic: (names, fields, writer.add_connection(topic, _TYPE, typestore=store))
+        for topic, names, fields in _topics(episodes, index)
     }
     none = np.zeros(0)
     for sample in range(episodes.steps[index] + 1):
         stamp = START + round(sample * episodes.dt * 1e9)
-        for motions, fields, connection in topics.values():
+        for names, fields, connection in topics.values():
             values = {field: array[sample] for field, array in fields.items() if sample < len(array)}
             if not values:
                 continue  # no command after the last step
             message = joint_state(
                 header(time(stamp // 10**9, stamp % 10**9), frame_id=""),
-                name=list(motions.joint_names),
+                name=names,
                 **{field: values.get(field, none) for field in _FIELD.values()},
             )
             writer.write(connection, stamp, store.serialize_cdr(message, _TYPE))
 
 
-def _topics(episodes: Episodes, index: int) -> Iterator[tuple[str, ArmMotions, dict[str, np.ndarray]]]:
-    """Topics with their arm and the values of each field of their messages [samples, joints], of one episode."""
+def _topics(episodes: Episodes, index: int) -> Iterator[tuple[str, list[str], dict[str, np.ndarray]]]:
+    """Topics of an episode with the names of their joints and the values of each field [samples, joints]."""
     arms = {"": episodes.robot}
     if episodes.expert is not None:
         arms = {"/expert": episodes.expert, "/learner": episodes.robot}
     steps = episodes.steps[index]
     for prefix, motions in arms.items():
-        states = {"position": motions.qpos[index], "velocity": motions.qvel[index]}
-        yield f"{prefix}/{_STATES}", motions, {field: _floats(array[: steps + 1]) for field, array in states.items()}
+        states = {field: _floats(array[: steps + 1]) for field, array in _states(motions, index).items()}
+        yield f"{prefix}/{_STATES}", [*motions.joint_names, *motions.gripper_names], states
         if motions.command is not None:
             commands = {_FIELD[motions.quantity]: _floats(motions.command[index][:steps])}
-            yield f"{prefix}/{_COMMANDS}", motions, commands
+            yield f"{prefix}/{_COMMANDS}", list(motions.joint_names), commands
+
+
+def _states(motions: ArmMotions, index: int) -> dict[str, np.ndarray]:
+    """Positions and velocities of the joints and then the gripper, whose velocities are not known."""
+    if motions.gripper is None:
+        return {"position": motions.qpos[index], "velocity": motions.qvel[index]}
+    gripper = motions.gripper[index]
+    return {
+        "position": np.concatenate([motions.qpos[index], gripper], axis=1),
+        "velocity": np.concatenate([motions.qvel[index], np.full_like(gripper, np.nan)], axis=1),
+    }
 
 
 def _floats(values: np.ndarray) -> np.ndarray:
