@@ -91,17 +91,38 @@ class ArmArrays:
         """Sum of the link lengths [m]."""
         return self.link_length.sum(axis=-1)
 
+    @property
+    def angle_limits(self) -> tuple[Any, Any]:
+        """Minimum and maximum angles [rad]: infinite for full revolutions, and both at home for locked joints."""
+        numpy = array_library(self.home)
+        lower, upper = self.joint_range[..., 0], self.joint_range[..., 1]
+        is_continuous = upper - lower >= 2 * np.pi - 1e-4  # models round pi in their text
+        limits = numpy.where(is_continuous, -np.inf, lower), numpy.where(is_continuous, np.inf, upper)
+        return tuple(numpy.where(self.is_free > 0, limit, self.home) for limit in limits)  # pyright: ignore
+
+    def in_chain_lengths(self) -> "ArmArrays":
+        """The arm with the lengths of its kinematics in units of its chain length."""
+        unit, names = 1 / self.chain_length, ("base_position", "offset", "link_position", "link_length")
+        return dataclasses.replace(self, **{name: unit * getattr(self, name) for name in names})
+
     def astype(self, dtype: Any) -> "ArmArrays":
         """The arm with floating numbers of another type."""
         return jax.tree.map(lambda x: x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x, self)
 
 
-def arm_arrays(arm: Arm, free: Sequence[bool] | np.ndarray | None = None) -> ArmArrays:
+def arm_arrays(
+    arm: Arm,
+    free: Sequence[bool] | np.ndarray | None = None,
+    *,
+    slots: tuple[int, int] = (MAX_JOINTS, MAX_LINKS),
+) -> ArmArrays:
     """The arrays of an arm, in double precision.
 
     Args:
       arm: a serial arm; joints that its config locks have no slot.
       free: whether each joint moves; the others are locked at home. All move where None.
+      slots: of joints and links. Arms with equal slots share compiled functions, which are faster with fewer. Physics
+        and environments take the default.
 
     Raises:
       ValueError: a tree, or more joints or links than there are slots.
@@ -110,9 +131,10 @@ def arm_arrays(arm: Arm, free: Sequence[bool] | np.ndarray | None = None) -> Arm
     joints, links = embodiment.num_joints, embodiment.num_links
     if not embodiment.is_serial:
         raise ValueError(f"{embodiment.name}: expected a serial arm, got a tree of {len(embodiment.chains)} chains")
-    if joints > MAX_JOINTS or links > MAX_LINKS:
+    max_joints, max_links = slots
+    if joints > max_joints or links > max_links:
         raise ValueError(
-            f"{embodiment.name}: expected at most {MAX_JOINTS} joints and {MAX_LINKS} links, got {joints} and {links}"
+            f"{embodiment.name}: expected at most {max_joints} joints and {max_links} links, got {joints} and {links}"
         )
     masses, rotations, origins = body_moments(arm)
     twist, offset, reference, _ = placements(rotations, origins)
@@ -126,22 +148,22 @@ def arm_arrays(arm: Arm, free: Sequence[bool] | np.ndarray | None = None) -> Arm
     arrays = ArmArrays(
         base_rotation=snap_to_units(rotations[0]),
         base_position=snap_to_units(origins[0]),
-        twist=_padded(snap_to_units(twist), MAX_JOINTS),
-        offset=_padded(snap_to_units(offset), MAX_JOINTS),
-        reference=_padded(reference, MAX_JOINTS),
-        first_moment=_padded(first_moment, MAX_JOINTS),
-        second_moment=_padded(second_moment, MAX_JOINTS),
-        armature=_padded(model.dof_armature, MAX_JOINTS),
-        damping=_padded(model.dof_damping, MAX_JOINTS),
-        is_free=_padded(is_free, MAX_JOINTS),
-        home=_padded(embodiment.home, MAX_JOINTS),
-        joint_range=_padded(embodiment.joint_range, MAX_JOINTS),
-        velocity_limit=_padded(finite_velocity_limit(embodiment), MAX_JOINTS),
-        torque_limit=_padded(embodiment.torque_limit, MAX_JOINTS),
-        link_joint=_padded(link_joint, MAX_LINKS).astype(np.int32),
-        link_position=_padded(snap_to_units(positions), MAX_LINKS),
-        link_direction=_padded(snap_to_units(directions), MAX_LINKS),
-        link_length=_padded(embodiment.link_lengths, MAX_LINKS),
+        twist=_padded(snap_to_units(twist), max_joints),
+        offset=_padded(snap_to_units(offset), max_joints),
+        reference=_padded(reference, max_joints),
+        first_moment=_padded(first_moment, max_joints),
+        second_moment=_padded(second_moment, max_joints),
+        armature=_padded(model.dof_armature, max_joints),
+        damping=_padded(model.dof_damping, max_joints),
+        is_free=_padded(is_free, max_joints),
+        home=_padded(embodiment.home, max_joints),
+        joint_range=_padded(embodiment.joint_range, max_joints),
+        velocity_limit=_padded(finite_velocity_limit(embodiment), max_joints),
+        torque_limit=_padded(embodiment.torque_limit, max_joints),
+        link_joint=_padded(link_joint, max_links).astype(np.int32),
+        link_position=_padded(snap_to_units(positions), max_links),
+        link_direction=_padded(snap_to_units(directions), max_links),
+        link_length=_padded(embodiment.link_lengths, max_links),
     )
     return _with_empty_slots(arrays, joints, links)
 

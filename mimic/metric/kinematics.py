@@ -231,7 +231,7 @@ def _frames_of_tree(arm: Embodiment, qpos: Array, qvel: Array) -> JointFrame:
     return jax.lax.scan(next_frame, frames, (rows, parent_rows, offsets, arm.joint_axis, qpos, qvel))[0]
 
 
-def resting_link_states(arm: Embodiment, qpos: Float[Array, "joints poses"]) -> LinkStates:
+def resting_link_states(arm: Embodiment | ArmArrays, qpos: Float[Array, "joints poses"]) -> LinkStates:
     """Normalized link states at rest of a batch of poses along the last axis.
 
     The same as `jax.vmap(link_states)`, which takes two to four times as long to compile and to run on a CPU.
@@ -243,7 +243,7 @@ def resting_link_states(arm: Embodiment, qpos: Float[Array, "joints poses"]) -> 
     Returns:
       Arrays [links, 3, poses].
     """
-    if arm.num_joints > LONG:
+    if isinstance(arm, ArmArrays) or arm.num_joints > LONG:
         return jax.vmap(functools.partial(link_states, arm), -1, -1)(qpos)
     columns = _link_state_columns(arm, [*qpos], None, normalized=True)
     return LinkStates(*(spatial.stack_batches(column, qpos[0]) for column in columns))

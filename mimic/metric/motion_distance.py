@@ -11,6 +11,7 @@ from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
+from mimic.arms.arrays import ArmArrays
 from mimic.arms.embodiment import LONG, Embodiment, in_chain_lengths
 from mimic.base import fused_kernel
 from mimic.base.batches import over_batch
@@ -33,8 +34,8 @@ MotionDistance = Callable[..., Float[Array, ""]]  # expert_qpos, expert_qvel, le
 
 # Above 40 lines because of its docstring.
 def motion_distance(
-    expert: Embodiment,
-    learner: Embodiment,
+    expert: Embodiment | ArmArrays,
+    learner: Embodiment | ArmArrays,
     correspondence: Correspondence,
     weights: Weights = PAPER_WEIGHTS,
     *,
@@ -51,7 +52,7 @@ def motion_distance(
     mode, and only with respect to the differentiated arguments. A batch of the function, or `jax.vmap` of its gradient,
     is one kernel on NVIDIA GPUs.
 
-    Any other metric, and any metric where an arm has more than 16 joints, composes `link_states` and
+    Any other metric, and any metric where an arm has more than 16 joints or is data, composes `link_states` and
     `embodiment_distance`, with automatic differentiation: the unrolled code of long arms takes minutes to compile.
 
     Args:
@@ -76,10 +77,10 @@ def motion_distance(
 
     # Validates the arguments for all implementations below.
     jax.eval_shape(composed, *(jax.ShapeDtypeStruct((arm.num_joints,), jnp.float32) for arm in arms for _ in range(2)))
-    is_short = max(expert.num_joints, learner.num_joints) <= LONG
-    if is_short and metric.is_static and _is_constant((arms, correspondence, weights)):
+    embodiments = [arm for arm in arms if isinstance(arm, Embodiment) and arm.num_joints <= LONG]
+    if len(embodiments) == len(arms) and metric.is_static and _is_constant((arms, correspondence, weights)):
         factors = _factors(np.asarray(correspondence, float), cast(DistanceWeights, weights))
-        distance = _unrolled([in_chain_lengths(_as_numpy(arm)) for arm in arms], factors)
+        distance = _unrolled([in_chain_lengths(_as_numpy(arm)) for arm in embodiments], factors)
     else:
         distance = composed
 

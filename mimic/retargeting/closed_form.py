@@ -21,6 +21,7 @@ pull, and the stiffness of position.
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from mimic.base import spatial
@@ -75,7 +76,7 @@ class Body(NamedTuple):
     position: Vector
 
 
-class _Load(NamedTuple):
+class Load(NamedTuple):
     """Sums over the links distal to a joint, about the origin of the base.
 
     Attributes:
@@ -125,16 +126,29 @@ def static_derivatives(
       smoothing: s and a.
       rotation: measure of directions.
     """
-    moments = [spatial.cross(anchor, axis) for anchor, axis in zip(anchors, axes, strict=True)]
-    gradient, rows = [], []
-    of_children: dict[int, _Load] = {}
+    loads: dict[int, Load] = {}  # of the links distal to each joint; that of the base is unused
     for joint in reversed(range(len(axes))):
-        load = of_children.get(joint, _Load())
+        load = loads.get(joint, Load())
         for link, pull in zip(links, pulls, strict=True):
             if link.joint == joint:
-                load = _add_directions(load, link.direction, pull, rotation, smoothing.angle)
-                load = _add_position(load, link.position, pull, smoothing.length)
-        axis, moment = axes[joint], moments[joint]
+                load = add_directions(load, link.direction, pull, rotation, smoothing.angle)
+                load = add_position(load, link.position, pull, smoothing.length)
+        loads[joint], parent = load, parents[joint]
+        loads[parent] = total(loads[parent], load) if parent in loads else load
+    return derivatives_of_loads(axes, anchors, [loads[joint] for joint in range(len(axes))], parents, loads[-1].value)
+
+
+def derivatives_of_loads(
+    axes: Sequence[Vector],
+    anchors: Sequence[Vector],
+    loads: Sequence["Load"],
+    parents: Sequence[int],
+    value: Scalar,
+) -> Derivatives:
+    """`static_derivatives` from the sums over the links distal to each joint, and the value of all of them."""
+    moments = [spatial.cross(anchor, axis) for anchor, axis in zip(anchors, axes, strict=True)]
+    gradient, rows = [], []
+    for joint, (load, axis, moment) in enumerate(zip(loads, axes, moments, strict=True)):
         local = spatial.add_outer(load.moment, spatial.scale(-1.0, anchors[joint]), load.force)
         gradient.append(spatial.dot(axis, _twice_antisymmetric(local)))
         trace = spatial.plus(spatial.plus(local[0][0], local[1][1]), local[2][2])
@@ -146,9 +160,30 @@ def static_derivatives(
         for k in _with_ancestors(joint, parents):
             row[k] = spatial.plus(spatial.dot(axes[k], torque), spatial.dot(moments[k], force))
         rows.append(row)
-        parent = parents[joint]
-        of_children[parent] = _total(of_children[parent], load) if parent in of_children else load
-    return Derivatives(of_children[-1].value, tuple(gradient[::-1]), rows[::-1])
+    return Derivatives(value, tuple(gradient), rows)
+
+
+def distal_loads(load: "Load", row_joint: Any, joints: int) -> list["Load"]:
+    """Sums over the rows distal to each joint of a serial arm.
+
+    Args:
+      load: of each row, arrays [rows, *lanes].
+      row_joint: [rows] index of the joint that moves the row, -1 for the base; may be traced.
+      joints: number of the arm's joints.
+    """
+    leaves, structure = jax.tree.flatten(load)
+    arrays = [index for index, leaf in enumerate(leaves) if not isinstance(leaf, float)]
+    table = jnp.stack(jnp.broadcast_arrays(*(leaves[index] for index in arrays)), axis=1)
+    is_distal = (jnp.arange(joints)[:, None] <= row_joint).astype(table.dtype)
+    sums = jnp.tensordot(is_distal, table, 1, precision=jax.lax.Precision.HIGHEST)
+
+    def of_joint(joint: int) -> "Load":
+        values = list(leaves)
+        for place, index in enumerate(arrays):
+            values[index] = sums[joint, place]
+        return jax.tree.unflatten(structure, values)
+
+    return [of_joint(joint) for joint in range(joints)]
 
 
 def _with_ancestors(joint: int, parents: Sequence[int]) -> list[int]:
@@ -158,8 +193,9 @@ def _with_ancestors(joint: int, parents: Sequence[int]) -> list[int]:
     return line[::-1]
 
 
-def _total(a: _Load, b: _Load) -> _Load:
-    return _Load(
+def total(a: Load, b: Load) -> Load:
+    """The sum of two loads."""
+    return Load(
         value=spatial.plus(a.value, b.value),
         force=spatial.add(a.force, b.force),
         moment=_sum(a.moment, b.moment),
@@ -169,7 +205,8 @@ def _total(a: _Load, b: _Load) -> _Load:
     )
 
 
-def _add_directions(load: _Load, direction: Vector, pull: Pull, rotation: RotationMeasure, smoothing: Scalar) -> _Load:
+def add_directions(load: Load, direction: Vector, pull: Pull, rotation: RotationMeasure, smoothing: Scalar) -> Load:
+    """The load with a pull on the direction of a link."""
     for unit, strength in zip(pull.units, pull.strengths, strict=True):
         if rotation == "cosine":
             difference = spatial.subtract(direction, unit)  # |e - t|^2 / 2 = 1 - e . t, exactly 0 at a match
@@ -200,7 +237,8 @@ def _smoothed_sine(sine_square: Scalar, smoothing: Scalar) -> Scalar:
     return jnp.sqrt(jnp.sin(smoothing) ** 2 + jnp.cos(smoothing) ** 2 * sine_square)
 
 
-def _add_position(load: _Load, position: Vector, pull: Pull, smoothing: Scalar) -> _Load:
+def add_position(load: Load, position: Vector, pull: Pull, smoothing: Scalar) -> Load:
+    """The load with a pull on the position of a link."""
     if not pull.points or all(isinstance(x, float) for x in position):  # such a position cannot move
         return load
     value, force, stiffness = load.value, spatial.ZERO, _NONE
@@ -216,7 +254,7 @@ def _add_position(load: _Load, position: Vector, pull: Pull, smoothing: Scalar) 
     coupling = spatial.cross(position, x), spatial.cross(position, y), spatial.cross(position, z)
     columns = [spatial.cross(position, column) for column in spatial.transpose(coupling)]
     angular = (columns[0][0], columns[1][0], columns[2][0], columns[1][1], columns[2][1], columns[2][2])
-    return _Load(
+    return Load(
         value=value,
         force=spatial.add(load.force, force),
         moment=spatial.add_outer(load.moment, position, force),

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mimic.arms.arrays import ArmArrays
 from mimic.arms.embodiment import Embodiment
 from mimic.base.compilation import by_value, compiled_quickly, has_tracer
+from mimic.base.spatial import array_library
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 from mimic.retargeting.pose_objective import PoseObjective, Target
 
@@ -30,7 +32,7 @@ class RandomPoses(NamedTuple):
     states: LinkStates
 
 
-def random_poses(arm: Embodiment, key: Array | None, sets: int, dtype: Any) -> RandomPoses:
+def random_poses(arm: Embodiment | ArmArrays, key: Array | None, sets: int, dtype: Any) -> RandomPoses:
     """Sets of random poses, uniform in the joint ranges; computed once for equal arguments.
 
     Args:
@@ -44,20 +46,28 @@ def random_poses(arm: Embodiment, key: Array | None, sets: int, dtype: Any) -> R
     return _constant_poses(arm, key, sets, jnp.dtype(dtype))
 
 
-def _traced_poses(arm: Embodiment, key: Array | None, sets: int, dtype: Any) -> RandomPoses:
+def _traced_poses(arm: Embodiment | ArmArrays, key: Array | None, sets: int, dtype: Any) -> RandomPoses:
     qpos = _uniform(_shape(arm, sets), key, *_range(arm, dtype))
     return RandomPoses(qpos, jax.vmap(jax.vmap(lambda q: link_states(arm, q)))(qpos))
 
 
 @by_value
-def _constant_poses(arm: Embodiment, key: Array | None, sets: int, dtype: Any) -> RandomPoses:
+def _constant_poses(arm: Embodiment | ArmArrays, key: Array | None, sets: int, dtype: Any) -> RandomPoses:
     """By NumPy, because the kinematics would take half a second to compile."""
     uniform = _compiled_uniform(
         _shape(arm, sets), None if key is None else jax.ShapeDtypeStruct(key.shape, key.dtype), dtype
     )
     with jax.ensure_compile_time_eval():
         qpos = np.asarray(uniform(key, *_range(arm, dtype)))
+        if isinstance(arm, ArmArrays):
+            return RandomPoses(qpos, jax.tree.map(np.asarray, _states_of_poses(arm.astype(dtype), qpos)))
     return RandomPoses(qpos, link_state_table(arm, qpos, np.zeros_like(qpos), dtype))
+
+
+@jax.jit
+def _states_of_poses(arm: ArmArrays, qpos: Array) -> LinkStates:
+    """Link states of sets of poses of an arm as data, compiled once for all arms."""
+    return jax.vmap(jax.vmap(functools.partial(link_states, arm)))(qpos)
 
 
 @by_value
@@ -71,11 +81,16 @@ def _uniform(shape: tuple[int, ...], key: Array | None, lower: Any, upper: Any) 
     return jax.random.uniform(key, shape, lower.dtype, minval=lower, maxval=upper)
 
 
-def _shape(arm: Embodiment, sets: int) -> tuple[int, int, int]:
+def _shape(arm: Embodiment | ArmArrays, sets: int) -> tuple[int, int, int]:
     return sets, -(-_POSES // sets), arm.num_joints
 
 
-def _range(arm: Embodiment, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
+def _range(arm: Embodiment | ArmArrays, dtype: Any) -> tuple[Any, Any]:
+    """Angles of random poses; both at home for joints locked by a mask."""
+    if isinstance(arm, ArmArrays):
+        free = arm.is_free > 0
+        limits = (array_library(arm.home).where(free, arm.joint_range[:, side], arm.home) for side in (0, 1))
+        return next(limits).astype(dtype), next(limits).astype(dtype)
     lower, upper = np.asarray(arm.joint_range, dtype).T
     return lower, upper
 

@@ -11,18 +11,19 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from mimic.arms.arrays import ArmArrays
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints, pose_limits
 from mimic.base.compilation import compiled_once
 from mimic.base.config import check_choice
 from mimic.base.spatial import array_library
-from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
+from mimic.metric.distance import Correspondence, DistanceWeights, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import resting_link_states
 from mimic.retargeting.costs import Costs, with_costs
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
 from mimic.retargeting.multistart import Descents, Method, best_descent
-from mimic.retargeting.pose_objective import pose_objective
+from mimic.retargeting.pose_objective import PoseObjective, pose_objective
 
 METHODS = ("newton", "gradient_descent")
 AnyArray = TypeVar("AnyArray", Array, np.ndarray)
@@ -48,8 +49,8 @@ class PoseImitation(NamedTuple):
 
 
 def imitate_pose(
-    expert: Embodiment,
-    learner: Embodiment,
+    expert: Embodiment | ArmArrays,
+    learner: Embodiment | ArmArrays,
     qpos: Float[ArrayLike, "*batch expert_joints"],
     correspondence: Correspondence,
     weights: Weights,
@@ -75,9 +76,14 @@ def imitate_pose(
     The first call compiles; later calls with equal arms, metric, options and shapes do not, see
     `mimic.base.compilation.by_value`. Functions in the metric are compared by identity: make a `lambda` once.
 
+    Arms as data (`ArmArrays`) with as many slots share one compiled function, whatever their numbers, weights and
+    locked joints. It is made for single poses: a batch takes six times as long as with embodiments, which are
+    constants. The metric must be a weighted sum, see `Metric.is_weighted_sum`, and there are no costs.
+
     Args:
       expert: n joints.
       learner: n_hat joints, optimised within their ranges; joints with a range of a full revolution end in [-pi, pi].
+        An arm as data if the expert is one; of the two, joints with the same index are those that both have.
       qpos: [n] or [..., n] the expert's poses [rad].
       correspondence: see `embodiment_distance`.
       weights: see `embodiment_distance`; velocities are zero.
@@ -113,11 +119,16 @@ def imitate_pose(
     warm = None if warm_start is None else checked_poses(learner, _concrete(warm_start), "warm_start")
     metric = Metric(correspondence, weights, rotation, reduction)
     descents = Descents(method, count, kept)
+    dtype = jax.dtypes.canonicalize_dtype(poses.dtype)
+    candidates = random_poses(learner, key, max(starts, 1), dtype)
+    if isinstance(expert, ArmArrays) or isinstance(learner, ArmArrays):
+        data = _data_of(expert, learner, metric, costs, dtype)
+        in_parallel = descents._replace(kept=None if kept is None else starts + 1)
+        return _data_solver(in_parallel, bool(starts), rotation)(data, poses, warm, candidates)
     solve = _pose_solver(
         expert, learner, metric, descents, bool(starts), costs, capsules if costs.of_capsules else None
     )
-    dtype = jax.dtypes.canonicalize_dtype(poses.dtype)
-    return solve(poses, warm, random_poses(learner, key, max(starts, 1), dtype))
+    return solve(poses, warm, candidates)
 
 
 def _concrete(values: ArrayLike) -> Any:
@@ -139,24 +150,91 @@ def _pose_solver(
     objective = with_costs(pose_objective(learner, metric), costs, expert, learner, capsules)
 
     def solve(batch: Array, warm: Array | None, candidates: RandomPoses) -> PoseImitation:
-        poses = jnp.asarray(batch).reshape(-1, expert.num_joints)
-        states = resting_link_states(expert, poses.T)
-        targets = jax.vmap(objective.target, (-1, 0), -1)(states, poses)
-        if warm is None:
-            first = shared_joints(expert, learner, poses)
-            guess = functools.partial(initial_guesses, objective, candidates=candidates if random else None)
-            guesses = jax.vmap(guess, (-1, 0), -1)(targets, first)
-        else:
-            warm = jnp.asarray(warm).reshape(-1, learner.num_joints)
-            guesses = jnp.broadcast_to(warm, (len(poses), learner.num_joints)).T[None]
-        solution = best_descent(objective.of_batch(targets), guesses, pose_limits(learner, poses.dtype), descents)
-        distance = jax.vmap(objective.distance, -1)(states, resting_link_states(learner, solution.qpos))
-        scale = typical_distance(objective, jax.tree.map(lambda x: x[..., 0], targets), candidates)
-        qpos = wrap_angles(solution.qpos.T, continuous_joints(learner))
-        solutions = PoseImitation(qpos, distance, solution.gradient_norm <= FLAT * scale)
-        return jax.tree.map(lambda x: x.reshape(*batch.shape[:-1], *x.shape[1:]), solutions)
+        return _nearest(expert, learner, objective, descents, batch, warm, candidates, random)
 
     return solve
+
+
+class _PoseData(NamedTuple):
+    """What the compiled function of arms as data takes beside the poses.
+
+    Attributes:
+      expert, learner: the arms.
+      matrix: correspondence of the links.
+      weights: of the metric.
+      pairs: [pairs, 2] links of both; all whose correspondence is not 0, and some others up to a fixed number.
+    """
+
+    expert: ArmArrays
+    learner: ArmArrays
+    matrix: Any
+    weights: DistanceWeights
+    pairs: Any
+
+
+def _data_of(expert: Any, learner: Any, metric: Metric, costs: Costs, dtype: Any) -> _PoseData:
+    """The data of two arms and their metric.
+
+    Raises:
+      ValueError: one arm that is no data, or a metric or costs that only embodiments have.
+    """
+    if not (isinstance(expert, ArmArrays) and isinstance(learner, ArmArrays)):
+        raise ValueError("expert, learner: expected two embodiments or two arms as data, got one of each")
+    if not metric.is_weighted_sum or costs != _NO_COSTS:
+        raise ValueError(
+            "metric, costs: expected a constant correspondence and weights, the reduction mean and no costs for arms "
+            "as data; embodiments take all"
+        )
+    shape = metric.correspondence.shape  # type: ignore[union-attr]
+    if isinstance(metric.correspondence, Tracer):
+        pairs = np.argwhere(np.ones(shape, bool))
+    else:
+        matrix = np.asarray(metric.correspondence)
+        pairs, empty = np.argwhere(matrix != 0), np.argwhere(matrix == 0)
+        count = sum(shape) if len(pairs) <= sum(shape) else matrix.size  # that of chains by arc length is below the sum
+        pairs = np.concatenate([pairs, empty, empty[:1].repeat(sum(shape), axis=0)])[:count]
+    matrix, weights = jax.tree.map(lambda x: _concrete(x).astype(dtype), (metric.correspondence, metric.weights))
+    return _PoseData(expert.astype(dtype), learner.astype(dtype), matrix, weights, pairs)
+
+
+@compiled_once
+def _data_solver(descents: Descents, random: bool, rotation: RotationMeasure) -> Callable[..., PoseImitation]:
+    """The function of data, poses, warm starts and random poses that `imitate_pose` compiles for arms as data."""
+
+    def solve(data: _PoseData, batch: Array, warm: Array | None, candidates: RandomPoses) -> PoseImitation:
+        objective = pose_objective(data.learner, Metric(data.matrix, data.weights, rotation), data.pairs)
+        return _nearest(data.expert, data.learner, objective, descents, batch, warm, candidates, random)
+
+    return solve
+
+
+def _nearest(
+    expert: Embodiment | ArmArrays,
+    learner: Embodiment | ArmArrays,
+    objective: PoseObjective,
+    descents: Descents,
+    batch: Array,
+    warm: Array | None,
+    candidates: RandomPoses,
+    random: bool,
+) -> PoseImitation:
+    """The nearest poses to a batch [..., n]."""
+    poses = jnp.asarray(batch).reshape(-1, expert.num_joints)
+    states = resting_link_states(expert, poses.T)
+    targets = jax.vmap(objective.target, (-1, 0), -1)(states, poses)
+    if warm is None:
+        first = shared_joints(expert, learner, poses)
+        guess = functools.partial(initial_guesses, objective, candidates=candidates if random else None)
+        guesses = jax.vmap(guess, (-1, 0), -1)(targets, first)
+    else:
+        warm = jnp.asarray(warm).reshape(-1, learner.num_joints)
+        guesses = jnp.broadcast_to(warm, (len(poses), learner.num_joints)).T[None]
+    solution = best_descent(objective.of_batch(targets), guesses, pose_limits(learner, poses.dtype), descents)
+    distance = jax.vmap(objective.distance, -1)(states, resting_link_states(learner, solution.qpos))
+    scale = typical_distance(objective, jax.tree.map(lambda x: x[..., 0], targets), candidates)
+    qpos = wrap_angles(solution.qpos.T, continuous_joints(learner))
+    solutions = PoseImitation(qpos, distance, solution.gradient_norm <= FLAT * scale)
+    return jax.tree.map(lambda x: x.reshape(*batch.shape[:-1], *x.shape[1:]), solutions)
 
 
 def wrap_angles(angles: Float[Any, "*batch joints"], where: Any = True, *, centre: Any = 0.0) -> Any:
@@ -172,15 +250,25 @@ def wrap_angles(angles: Float[Any, "*batch joints"], where: Any = True, *, centr
 
 
 def shared_joints(
-    expert: Embodiment, learner: Embodiment, values: Float[Any, "*batch expert_joints"]
+    expert: Embodiment | ArmArrays, learner: Embodiment | ArmArrays, values: Float[Any, "*batch expert_joints"]
 ) -> Float[Any, "*batch learner_joints"]:
-    """The expert's values in the joints that both arms have by name; zero in the learner's other joints."""
+    """The expert's values in the joints that both arms have by name; zero in the learner's other joints.
+
+    Arms as data have joints by index; locked ones stay at home, and so do the learner's further ones.
+    """
+    if isinstance(expert, ArmArrays) or isinstance(learner, ArmArrays):
+        common = min(values.shape[-1], learner.num_joints)
+        home = jnp.broadcast_to(learner.home, (*values.shape[:-1], learner.num_joints)).astype(values.dtype)
+        filled = home.at[..., :common].set(values[..., :common])
+        return jnp.where(jnp.asarray(learner.is_free) > 0, filled, home)  # type: ignore[union-attr]
     names = expert.joint_names
     index = np.array([names.index(name) if name in names else -1 for name in learner.joint_names])
     return array_library(values).where(index >= 0, values[..., index], 0)
 
 
-def checked_poses(arm: Embodiment, poses: AnyArray, name: str = "qpos", *, axes: Sequence[str] = ()) -> AnyArray:
+def checked_poses(
+    arm: Embodiment | ArmArrays, poses: AnyArray, name: str = "qpos", *, axes: Sequence[str] = ()
+) -> AnyArray:
     """The poses as floating-point numbers.
 
     Args:
