@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.arm import ArmConfig, arm_spec, build_arm
-from mimic.arms.kinematic_tree import ChainIds, ancestors, find_chain
+from mimic.arms.kinematic_tree import ChainIds, find_chain
+from mimic.arms.model_tree import ancestors
 from mimic.arms.mujoco_chain import data_at_zero
 
 _SPHERE, _CAPSULE, _CYLINDER, _MESH, _PLANE = (

@@ -41,7 +41,8 @@ def find_end(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> ArmEnd:
     """The end of an arm whose last joint is given.
 
     In this order: a frame that is named as tools are; the mean of the tips of its fingers; a frame that is named as
-    hands are; the farthest other frame that is not a sensor's; the farthest end of a simple shape; the joint itself.
+    hands are; a single finger; the farthest other frame that is not a sensor's; the farthest end of a simple shape; the
+    joint itself.
 
     Args:
       model: with the arm.
@@ -52,10 +53,13 @@ def find_end(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> ArmEnd:
     frames = list(_frames(model, data, last))
     if tool := _best(frames, tool_rank, anchor):
         return ArmEnd(tool.point, f"{tool}, named as tools are")
-    if tips := _finger_tips(model, data, last, anchor):
+    tips = _finger_tips(model, data, last, anchor)
+    if len(tips) > 1:
         return ArmEnd(np.mean([tip.point for tip in tips], axis=0), f"between {', '.join(map(str, tips))}")
     if hand := _best(frames, hand_rank, anchor):
         return ArmEnd(hand.point, f"{hand}, named as hands are")
+    if tips:
+        return ArmEnd(tips[0].point, f"{tips[0]}, a finger")
     others = [frame for frame in frames if not is_sensor(frame.name) and _distance(frame.point, anchor) > _AT_JOINT]
     if others:
         farthest = max(others, key=lambda frame: _distance(frame.point, anchor))

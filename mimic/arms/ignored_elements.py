@@ -3,7 +3,8 @@
 import mujoco
 import numpy as np
 
-from mimic.arms.kinematic_tree import ChainIds, Tip, find_chain, joint_kind
+from mimic.arms.kinematic_tree import ChainIds, Tip, find_chain
+from mimic.arms.model_tree import joint_kind
 
 _MAX_NAMES = 6  # in a list; the others are counted
 _AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)

@@ -1,24 +1,21 @@
 """Finds the arm in a MuJoCo model: the serial chain of revolute joints to a tip, or the tree to several."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import mujoco
 
-from mimic.arms.hand import named_frame
-from mimic.arms.names import hand_rank, is_gripper_joint, is_other_limb
+from mimic.arms.branches import longest_branch
+from mimic.arms.model_tree import ancestors, body_id, is_revolute, joint_ids, joint_kind, tip_body
 
 # As ints: a MuJoCo enum equals a NumPy integer in one order of the operands and not in the other.
-_REVOLUTE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _COUPLED_JOINTS = int(mujoco.mjtEq.mjEQ_JOINT)
 _CONNECT, _WELD = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
 _SITE = int(mujoco.mjtObj.mjOBJ_SITE)
-_KINDS = {int(kind): kind.name.removeprefix("mjJNT_").lower() for kind in mujoco.mjtJoint.__members__.values()}
 
 Tip = str | Sequence[str] | None
 ALL_ENDS = "*"  # in a list of tips
-_MAX_ENDS = 6  # in a message
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +88,7 @@ def find_chain(model: mujoco.MjModel, base: str | None = None, tip: Tip = None) 
 def _ends(model: mujoco.MjModel, start: int, tip: Tip) -> tuple[tuple[str | None, ...], tuple[int, ...]]:
     """The name of each tip, None where none is named, and the last body of each chain."""
     if tip is None:
-        return (None,), (_longest(model, start),)
+        return (None,), (longest_branch(model, start),)
     names = (tip,) if isinstance(tip, str) else tuple(tip)
     if names == (ALL_ENDS,) and not isinstance(tip, str):
         ends = tuple(_all_ends(model, start))
@@ -140,140 +137,6 @@ def _revolute_joints(model: mujoco.MjModel, start: int, last: int) -> tuple[int,
             "distal to it with base=, or end proximal to it with tip="
         )
     return tuple(revolute)
-
-
-def joint_kind(model: mujoco.MjModel, joint: int) -> str:
-    """MuJoCo's name of a joint's type: hinge, slide, ball or free."""
-    return _KINDS[int(model.jnt_type[joint])]
-
-
-def joint_ids(model: mujoco.MjModel, body: int) -> range:
-    """Joints of a body, in order."""
-    return range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
-
-
-def is_revolute(model: mujoco.MjModel, joint: int) -> bool:
-    """Whether a joint is revolute (MuJoCo: hinge)."""
-    return int(model.jnt_type[joint]) == _REVOLUTE
-
-
-def ancestors(model: mujoco.MjModel, body: int) -> list[int]:
-    """The body, its parent, … and the world."""
-    line = [int(body)]
-    while line[-1] != 0:
-        line.append(int(model.body_parentid[line[-1]]))
-    return line
-
-
-def body_id(model: mujoco.MjModel, name: str) -> int:
-    """Id of the body with a name.
-
-    Raises:
-      ValueError: no body has this name.
-    """
-    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
-    if body < 0:
-        names = ", ".join(model.body(b).name or f"#{b}" for b in range(1, model.nbody))
-        raise ValueError(f"the model has no body {name!r}; valid are {names}")
-    return body
-
-
-def tip_body(model: mujoco.MjModel, tip: str) -> int:
-    """Id of the body with a name, or of the body with the site of this name.
-
-    Raises:
-      ValueError: no body or site has this name.
-    """
-    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)
-    if site >= 0:
-        return int(model.site_bodyid[site])
-    try:
-        return body_id(model, tip)
-    except ValueError as error:
-        sites = ", ".join(filter(None, (model.site(s).name for s in range(model.nsite)))) or "none"
-        raise ValueError(f"{error}, nor a site of that name; valid are {sites}") from None
-
-
-def _longest(model: mujoco.MjModel, start: int) -> int:
-    """The last body with a joint of an arm on the longest chain distal to a body, not beyond a tool."""
-    counts = _arm_joint_counts(model, start)
-    ends = list(_branch_ends(model, start, counts))
-    if len(ends) == 1:
-        return _before_tool(model, ends[0], counts)
-    total = sum(counts[body] for body in ancestors(model, ends[0]))
-    tools = [named_frame(model, end) for end in ends]
-    names = [tool or named_frame(model, end, hand_rank) or model.body(end).name
-             for tool, end in zip(tools, ends, strict=True)]  # fmt: skip
-    likeliest = next(filter(None, tools), names[0])
-    raise ValueError(
-        f"the model branches: {len(ends)} chains of {total} revolute joints end at "
-        f"{', '.join(map(repr, names[:_MAX_ENDS]))}{' and others' if len(names) > _MAX_ENDS else ''}; name one, as in "
-        f'tip={likeliest}, several, as in tip=[{",".join(names[:2])}], or all ends of the model with tip=["*"]'
-    )
-
-
-def _arm_joint_counts(model: mujoco.MjModel, start: int) -> list[int]:
-    """Number of revolute joints of each body that may be an arm's: without grippers and other limbs, if some remain."""
-    revolute = [[j for j in joint_ids(model, body) if is_revolute(model, j)] for body in range(model.nbody)]
-
-    def counts(is_left_out: Callable[[str, str], bool]) -> list[int]:
-        left_out = {0: False}
-        for body in range(1, model.nbody):
-            names = [model.joint(joint).name for joint in joint_ids(model, body)]
-            left_out[body] = left_out[int(model.body_parentid[body])] or any(
-                is_left_out(name, model.body(body).name) for name in names
-            )
-        return [
-            0 if left_out[body] or start not in ancestors(model, body) else len(revolute[body]) for body in left_out
-        ]
-
-    rules = (lambda *names: is_gripper_joint(*names) or is_other_limb(*names), is_gripper_joint, lambda *_: False)
-    return next((found for rule in rules if any(found := counts(rule))), [0] * model.nbody)
-
-
-def _branch_ends(
-    model: mujoco.MjModel, body: int, counts: Sequence[int], chain: int = 0, last: int | None = None
-) -> Iterator[int]:
-    """The last body with a joint on each of the longest chains distal to a body, several if they are equally long.
-
-    Args:
-      model: with the chains.
-      body: at which they start.
-      counts: number of joints of each body.
-      chain: number of joints up to this body.
-      last: the last body with a joint up to this one.
-    """
-    distal = list(counts)  # joints on the longest chain from each body on
-    for child in range(model.nbody - 1, 0, -1):  # children come after their parents
-        parent = int(model.body_parentid[child])
-        distal[parent] = max(distal[parent], counts[parent] + distal[child])
-    last = body if last is None or counts[body] else last
-    while True:
-        branches = [child for child in range(1, model.nbody) if model.body_parentid[child] == body and distal[child]]
-        longest = [child for child in branches if distal[child] == max(distal[branch] for branch in branches)]
-        if not branches or (len(branches) > 1 and chain > distal[longest[0]]):
-            yield last
-            return
-        if len(longest) > 1:
-            for child in longest:
-                yield from _branch_ends(model, child, counts, chain + counts[child], last)
-            return
-        body = longest[0]
-        chain += counts[body]
-        last = body if counts[body] else last
-
-
-def _before_tool(model: mujoco.MjModel, last: int, counts: Sequence[int]) -> int:
-    """The last body of a chain, or an earlier one with a tool, if fewer joints are distal of it than proximal."""
-    distal = 0
-    for body in (body for body in ancestors(model, last) if counts[body]):
-        proximal = sum(counts[part] for part in ancestors(model, body))
-        if distal >= proximal:
-            break
-        if named_frame(model, body):
-            return body
-        distal += counts[body]
-    return last
 
 
 def _reject_coupled(model: mujoco.MjModel, joints: set[int]) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NoReturn
 from xml.etree import ElementTree
 
-from mimic.arms.urdf import mend_urdf
+from mimic.arms.urdf import is_xacro, mend_urdf
 from mimic.base.files import check_file, file_digest, read_bytes
 
 MAX_FILE_SIZE = 8 * 2**20  # bytes of XML; the largest robot models known to us have 1 MiB
@@ -25,8 +25,6 @@ _PACKAGE = re.compile(r"package:/+([^/]+)/(.*)", re.DOTALL)
 _COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)
 _TAG = re.compile(r"<[^<>]*>")
 _MESH_FORMATS = (".stl", ".obj", ".msh")
-_EXPRESSION = re.compile(r"\$[{(]")
-_TEMPLATES = {"include", "macro", "property", "arg", "if", "unless"}  # elements of xacro that make a file a template
 
 
 @dataclasses.dataclass(frozen=True)
@@ -269,21 +267,13 @@ class _Reader:
             if "unbound prefix" in str(error) and "<xacro:" in text:
                 self._reject_xacro()
             raise ValueError(f"{self._unreadable}: {file.name!r}: {error}") from None
-        if root.tag == "robot" and _is_xacro(root):
+        if root.tag == "robot" and is_xacro(root):
             self._reject_xacro()
         for element in root.iter():
             for name, value in element.attrib.items():
                 if not value.isprintable():  # a name must not break a message's line
                     element.attrib[name] = "".join(c if c.isprintable() else " " for c in value)
         return root
-
-
-def _is_xacro(root: ElementTree.Element) -> bool:
-    """Whether a URDF is a template; calls of macros that an expanded file still has are nothing of a robot."""
-    names = {element.tag.partition("}")[2] for element in root.iter() if "xacro" in element.tag.partition("}")[0]}
-    parts = (part for tag in ("link", "joint") for element in root.findall(tag) for part in element.iter())
-    has_expressions = any(_EXPRESSION.search(value) for part in parts for value in part.attrib.values())
-    return has_expressions or bool(names & _TEMPLATES) or bool(names and root.find("joint") is None)
 
 
 def _read_compilers(root: ElementTree.Element) -> tuple[str, str, bool]:

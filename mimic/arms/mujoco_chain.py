@@ -11,7 +11,8 @@ from jaxtyping import Float
 from mimic.arms.chain import SHORTEST_LINK, Chain, Joint, Link, drop_zero_length
 from mimic.arms.compile_check import VELOCITY_LIMIT, joint_numbers
 from mimic.arms.hand import ArmEnd, find_end
-from mimic.arms.kinematic_tree import Tip, find_chain, is_revolute, tip_body
+from mimic.arms.kinematic_tree import Tip, find_chain
+from mimic.arms.model_tree import is_revolute, tip_body
 
 START_POSES = "ready", "home"  # keyframes with the start pose of a model, in order of preference
 

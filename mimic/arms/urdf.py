@@ -4,6 +4,7 @@ Kinematics needs none of it, so that a file loads without. Each change is a line
 """
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from xml.etree import ElementTree
 
@@ -24,6 +25,16 @@ _POINT_RADIUS = 1e-3  # m, radius of gyration of a body with a mass and no inert
 _ASSUMED_MASS, _ASSUMED_LIGHT, _ASSUMED_RADIUS = 1.0, 1e-3, 0.1  # kg; where others have a mass; m
 _MAX_RANGE, _MAX_TORQUE = MAX_VALUES["joint range [rad or m]"][0], MAX_VALUES["torque limit [N m]"][0]
 _MAX_NAMES = 6  # in a line
+_EXPRESSION = re.compile(r"\$[{(]")
+_TEMPLATES = {"include", "macro", "property", "arg", "if", "unless"}  # elements of xacro that make a file a template
+
+
+def is_xacro(root: _Element) -> bool:
+    """Whether a URDF is a template; calls of macros that an expanded file still has are nothing of a robot."""
+    names = {element.tag.partition("}")[2] for element in root.iter() if "xacro" in element.tag.partition("}")[0]}
+    parts = (part for tag in ("link", "joint") for element in root.findall(tag) for part in element.iter())
+    has_expressions = any(_EXPRESSION.search(value) for part in parts for value in part.attrib.values())
+    return has_expressions or bool(names & _TEMPLATES) or bool(names and root.find("joint") is None)
 
 
 def mend_urdf(root: _Element) -> tuple[str, ...]:

@@ -10,8 +10,9 @@ from jaxtyping import Float
 
 from mimic.arms.arm import ArmConfig, arm_spec, build_arm
 from mimic.arms.embodiment import Embodiment
-from mimic.arms.kinematic_tree import ChainIds, ancestors, find_chain
+from mimic.arms.kinematic_tree import ChainIds, find_chain
 from mimic.arms.link_match import Colour
+from mimic.arms.model_tree import ancestors
 from mimic.arms.mujoco_chain import base_pose, data_at_zero
 
 _THICKNESS, _COLOUR = 0.03, (0.55, 0.62, 0.70, 1.0)  # of links without geoms; fraction of the chain length

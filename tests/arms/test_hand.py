@@ -14,6 +14,12 @@ def body(name, pos, inner="", joint="", kind="hinge"):
     return f'<body name="{name}" pos="{pos}">{joint}{inner}</body>'
 
 
+def chain(prefix, count, end=""):
+    for number in range(count, 0, -1):
+        end = body(f"{prefix}_l{number}", "0.3 0 0", end, f"{prefix}_j{number}")
+    return end
+
+
 def arm(end, joints=3):
     """Joints j1, j2, … 1 m apart along x, and what is fixed to the last one."""
     for number in range(joints, 0, -1):
@@ -28,6 +34,7 @@ def model(worldbody, rest=""):
 
 
 FINGERS = body("left", "0.1 0.05 0", joint="a", kind="slide") + body("right", "0.1 -0.05 0", joint="b", kind="slide")
+JAW = body("moving_jaw", "0.1 0 0", joint="jaw")
 CAMERA = body("camera_frame", "0 0 0.9")
 ENDS = {  # what is fixed to the last link: its length, and the end in words
     "tool at the last joint": (body("tool0", "0 0 0") + CAMERA, 0, "body 'tool0', named as tools are"),
@@ -37,6 +44,8 @@ ENDS = {  # what is fixed to the last link: its length, and the end in words
     "tool of tools": (body("flange", "0.1 0 0", body("x_tool_frame", "0.1 0 0")), 0.2, "body 'x_tool_frame', named"),
     "between the fingers": (FINGERS + body("palm", "0.05 0 0"), 0.1, "between body 'left', body 'right'"),
     "a tool of a gripper": (FINGERS + body("ee_link", "0.15 0 0"), 0.15, "body 'ee_link', named as tools are"),
+    "a jaw and a hand": (JAW + body("gripper_link", "0.2 0 0"), 0.2, "body 'gripper_link', named as hands"),
+    "a jaw": (JAW, 0.1, "body 'moving_jaw', a finger"),
     "hand": (body("gripper_link", "0.1 0 0") + body("plate", "0 0 0.5"), 0.1, "body 'gripper_link', named as hands"),
     "frame": (body("plate", "0 0.2 0") + CAMERA, 0.2, "body 'plate', the farthest frame"),
     "shape": ('<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.01"/>', 0.3, "the farthest end of the shapes"),
@@ -68,6 +77,7 @@ GRIPPERS = {
     "a jaw by its link": (body("Moving_Jaw", "0.1 0 0", joint="j4"), ARM),
     "a shaft beside the tool": (body("prop", "0 0 0", joint="shaft") + body("ee_gripper", "0.1 0 0"), ARM),
     "a joint distal of the tool": (body("tool0", "0.1 0 0", body("x", "0 0 0", joint="j4")), ARM),
+    "a hand": (body("palm", "0 0 0", chain("thumb", 2) + chain("middle", 1)), ARM),
     "a mover": (body("gripperMover", "0.1 0 0", joint="jointGripper"), ARM),
     "a wrist": (body("gripper_link", "0.1 0 0", joint="wrist_roll"), (*ARM, "wrist_roll")),
     "a wrist of a gripper": (body("x", "0.1 0 0", joint="gripper_roll"), (*ARM, "gripper_roll")),
@@ -80,12 +90,6 @@ GRIPPERS = {
 def test_joints_of_the_gripper_are_not_the_arms(case):
     content, names = GRIPPERS[case]
     assert load_mjcf(arm(content)).joint_names == names
-
-
-def chain(prefix, count, end=""):
-    for number in range(count, 0, -1):
-        end = body(f"{prefix}_l{number}", "0.3 0 0", end, f"{prefix}_j{number}")
-    return end
 
 
 def test_heads_and_legs_are_no_arm_beside_one():
@@ -162,10 +166,6 @@ def test_sides(names, expected):
 
 
 def test_names_of_tools_and_grippers():
-    assert [tool_rank(name) for name in ("panda_hand_tcp", "tool0", "wrist_3_link", "camera_tool")] == [
-        0,
-        10,
-        None,
-        None,
-    ]
+    assert tool_rank("panda_hand_tcp") == 0 and tool_rank("grip_site") < tool_rank("tool0") < tool_rank("flange")
+    assert {tool_rank(name) for name in ("wrist_3_link", "camera_tool", "gripper_link")} == {None}
     assert is_gripper_joint("l_finger", "pad") and not is_gripper_joint("j6", "gripper_base")
