@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -13,17 +12,18 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.commands.capture import fixed_fraction, read_arm, trunk_length
+from mimic.commands.capture import fixed_fraction, named_arm, read_arm, trunk_length
 from mimic.commands.config import CaptureConfig, ViewConfig
 from mimic.envs.config import EnvConfig
+from mimic.motions.mocap.arms import find_arms, find_facing
 from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
 from mimic.motions.mocap.clips import slow_down_for
 from mimic.motions.mocap.conventions import UNITS
 from mimic.motions.mocap.link_motion import LinkMotion
-from mimic.motions.mocap.live_points import LiveArm, Sample, find_live_arms
+from mimic.motions.mocap.live_points import LiveArm, Sample, live_body
 from mimic.motions.mocap.point_socket import PointListener
 from mimic.runs.signals import Signals, noted_signals
-from mimic.viewer.captured import Clip, ClipPlayer, PointTracker, make_clip
+from mimic.viewer.captured import Clip, ClipPlayer, PointTracker, Said, make_clip
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.origins import is_local
 
@@ -126,12 +126,7 @@ def wait_for_arm(listener: PointListener, config: ViewConfig, env: EnvConfig) ->
 
     Points that are no arm's print a line, and it waits for others.
     """
-    side, signals, said = config.arm or "right", Signals(), set()
-
-    def say(line: str) -> None:
-        if line not in said:
-            said.add(line)
-            print(f"view: {line}", file=sys.stderr, flush=True)
+    side, signals, say = config.arm or "right", Signals(), Said()
 
     fixed = fixed_fraction(build_arm(env.learner, env.limits, env.metric.links).embodiment)
     print(f"view: waiting for points at {config.source}   (Ctrl-C ends it)", flush=True)
@@ -161,12 +156,14 @@ def wait_for_arm(listener: PointListener, config: ViewConfig, env: EnvConfig) ->
 
 
 def _live_arm(sample: Sample, side: str, capture: CaptureConfig) -> LiveArm:
-    up = capture.up or "z"
-    arms = find_live_arms(sample, capture.unit, up=up)
+    named = named_arm(capture, side)
+    body = live_body(sample, capture.unit, up=capture.up, subject=capture.subject, arm=named)
+    arms = find_arms(body)
     if side not in arms:
         raise ValueError(f"arm: expected {' or '.join(arms)}, which the points have, got {side!r}")
     yaw, pitch, roll = np.radians([capture.yaw, capture.pitch, capture.roll])
-    return LiveArm(arms, side, UNITS[capture.unit or "m"], up, 0.0, (yaw, pitch, roll))
+    unit, up = UNITS[capture.unit or "m"], capture.up or "z"
+    return LiveArm(arms, side, unit, up, 0.0, (yaw, pitch, roll), facing=find_facing(body))
 
 
 def _measured(arm: LiveArm, samples: list[Sample], capture: CaptureConfig, fixed: float) -> tuple[LiveArm, LinkMotion]:
@@ -174,7 +171,7 @@ def _measured(arm: LiveArm, samples: list[Sample], capture: CaptureConfig, fixed
     trunk = trunk_length(arm.motion(samples).chain_length, capture, fixed)
     arm = dataclasses.replace(arm, trunk=trunk)
     links = arm.motion(samples)
-    return dataclasses.replace(arm, zero=zero_frames(links)), links
+    return dataclasses.replace(arm, zero=zero_frames(links), lengths=links.link_lengths), links
 
 
 @contextlib.contextmanager

@@ -3,6 +3,8 @@
 import bisect
 import dataclasses
 import math
+import re
+import sys
 from collections.abc import Sequence
 
 import numpy as np
@@ -105,16 +107,31 @@ class ClipPlayer:
             self._jumped = self._changed = True
 
 
+class Said:
+    """Prints one line for each kind of fault, however often it occurs and whatever its numbers are."""
+
+    def __init__(self) -> None:
+        self._kinds: set[str] = set()
+
+    def __call__(self, line: str) -> None:
+        """Prints a line, unless one that differs in numbers alone was printed before."""
+        kind = re.sub(r"[-+]?\d[\d.e+-]*", "#", line)
+        if kind not in self._kinds:
+            self._kinds.add(kind)
+            print(f"view: {line}", file=sys.stderr, flush=True)
+
+
 class PointTracker:
     """Poses of an arm from the newest points of a listener.
 
     Attributes:
       incomplete: number of samples without all points of the arm; the arm stays where it is.
+      unusable: number of samples with all of them that are no pose of the arm, as where its lengths have changed.
     """
 
     def __init__(self, listener: PointListener, arm: LiveArm):
-        self._listener, self._arm = listener, arm
-        self.incomplete = 0
+        self._listener, self._arm, self._say = listener, arm, Said()
+        self.incomplete = self.unusable = 0
         self._paused = PAUSE  # s since the last pose
 
     def advance(self, dt: float) -> tuple[np.ndarray | None, bool]:
@@ -123,12 +140,14 @@ class PointTracker:
         sample = self._listener.take()
         if sample is None:
             return None, False
-        try:
-            pose = self._arm.pose(sample) if self._arm.has_all(sample) else None
-        except ValueError:  # points that coincide
-            pose = None
-        if pose is None:
+        if not self._arm.has_all(sample):
             self.incomplete += 1
+            return None, False
+        try:
+            pose = self._arm.pose(sample)
+        except ValueError as error:
+            self.unusable += 1
+            self._say(f"{error}; the arms hold their pose")
             return None, False
         paused, self._paused = self._paused, 0.0
         return pose, paused >= PAUSE
@@ -148,6 +167,7 @@ class PointTracker:
         counts = self._listener.counts
         faults = {
             "bad lines": counts.bad, "without all points of the arm": self.incomplete,
+            "that are no pose of it": self.unusable,
             "replaced by newer ones": counts.unused, "rejected connections": counts.rejected,
         }  # fmt: skip
         return ", ".join([f"{counts.received} samples", *(f"{n} {what}" for what, n in faults.items() if n)])

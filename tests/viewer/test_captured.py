@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from mimic.motions.mocap.arms import find_arms
 from mimic.motions.mocap.ball_chain import zero_frames
 from mimic.motions.mocap.link_motion import arm_motion
-from mimic.motions.mocap.live_points import LiveArm, Sample, find_live_arms
+from mimic.motions.mocap.live_points import LiveArm, Sample, live_body
 from mimic.motions.mocap.point_socket import Counts
-from mimic.viewer.captured import Clip, ClipPlayer, PointTracker, make_clip
+from mimic.viewer.captured import Clip, ClipPlayer, PointTracker, Said, make_clip
 from tests.helpers.bodies import RATE, person
 
 
@@ -77,22 +78,33 @@ class Listener:
         return self._samples.pop(0) if self._samples else None
 
 
-def test_a_tracker_holds_its_pose_where_points_are_missing():
+def test_a_tracker_holds_its_pose_where_points_are_missing_or_wrong(capsys):
     body = person(10)
     samples = [Sample(i / RATE, dict(zip(body.names, row, strict=True))) for i, row in enumerate(body.positions)]
-    arm = LiveArm(find_live_arms(samples[0], ""), "right", 1.0, "z", 0.0, (0.0, 0.0, 0.0))
+    arm = LiveArm(find_arms(live_body(samples[0])), "right", 1.0, "z", 0.0, (0.0, 0.0, 0.0))
     arm = dataclasses.replace(arm, zero=zero_frames(arm.motion(samples)))
     unseen = Sample(1.0, {**samples[2].points, "RightHand": np.full(3, np.nan)})
     together = Sample(1.0, {**samples[2].points, "RightHand": samples[2].points["RightForeArm"]})
-    listener = Listener([samples[0], unseen, together, samples[1]])
+    listener = Listener([samples[0], unseen, together, samples[1], together])
     tracker = PointTracker(listener, arm)  # type: ignore[arg-type]
     first, second, third, fourth, fifth = (tracker.advance(0.02) for _ in range(5))
     assert first[0] is not None and first[1]  # the first pose may be anywhere
     assert second == third == fifth == (None, False)
     assert fourth[0] is not None
     np.testing.assert_allclose(fourth[0], arm.pose(samples[1]))
-    assert not fourth[1] and tracker.incomplete == 2
-    assert tracker.summary == "7 samples, 2 bad lines, 2 without all points of the arm, 1 rejected connections"
+    assert not fourth[1] and (tracker.incomplete, tracker.unusable) == (1, 2)
+    faults = "2 bad lines, 1 without all points of the arm, 2 that are no pose of it, 1 rejected connections"
+    assert tracker.summary == f"7 samples, {faults}"
+    assert capsys.readouterr().err.splitlines() == [
+        "view: points: expected those of a link apart; the arms hold their pose"
+    ]
+
+
+def test_a_kind_of_fault_is_said_once(capsys):
+    say = Said()
+    for line in ("time: expected more than 1.5 s, got 1", "time: expected more than 2 s, got 1e-3", "arm: none"):
+        say(line)
+    assert capsys.readouterr().err.splitlines() == ["view: time: expected more than 1.5 s, got 1", "view: arm: none"]
 
 
 def test_a_sender_that_stops_is_said():

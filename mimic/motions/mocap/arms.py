@@ -84,7 +84,8 @@ def _by_side(named: _Named) -> dict[str, dict[int, Part]]:
 
 
 def _is_seen(motion: PointMotion, index: int) -> bool:
-    return bool(np.isfinite(motion.positions[:, index]).all(axis=1).any())
+    """Whether a point was seen; in a single sample, which is one of many to come, each one counts."""
+    return len(motion.positions) == 1 or bool(np.isfinite(motion.positions[:, index]).all(axis=1).any())
 
 
 def _names(motion: PointMotion, indices: Iterable[int]) -> tuple[str, ...]:

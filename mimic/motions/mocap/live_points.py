@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mimic.motions.mocap.arms import find_arms
+from mimic.motions.mocap.arms import find_arms, unnamed
 from mimic.motions.mocap.ball_chain import ball_chain_pose
 from mimic.motions.mocap.clips import turn_matrix, turned
-from mimic.motions.mocap.conventions import UNITS, arm_length, guessed_units, z_up
+from mimic.motions.mocap.conventions import UNITS, arm_length, find_up, guessed_units, z_up
 from mimic.motions.mocap.link_motion import LinkMotion, arm_motion, link_ends_from_shoulder
 from mimic.motions.mocap.points import ArmPoints, PointMotion
+from mimic.motions.mocap.reading import one_person, with_arm
 
 MAX_POINTS = 2000
 _MAX_NAME = 200  # characters
@@ -26,6 +27,7 @@ _MAX_VALUE = 1e6  # of a coordinate
 _NO_PARENT = -1
 _UNSEEN = math.nan, math.nan, math.nan
 _SHORTEST = 1e-3  # m; of a link
+_CHANGED = 0.3  # of a link's length
 
 
 class Sample(NamedTuple):
@@ -92,6 +94,7 @@ class LiveArm:
       turn: yaw, pitch and roll by which the person is turned [rad], see `turned`.
       zero: frames of the links in the zero pose, see `ball_chain_xml`.
       facing: see `find_facing`. Default None: the shoulders of the arms.
+      lengths: of the links [m]; None before they are measured.
     """
 
     arms: dict[str, ArmPoints]
@@ -102,6 +105,7 @@ class LiveArm:
     turn: tuple[float, float, float]
     zero: Float[np.ndarray, "links 3 3"] | None = None
     facing: dict[str, tuple[str, ...]] | None = None
+    lengths: Float[np.ndarray, " links"] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -133,7 +137,7 @@ class LiveArm:
         """Joint angles of the arm's model in a sample that has all points [rad].
 
         Raises:
-          ValueError: points coincide, so that a link has no direction.
+          ValueError: points coincide, so that a link has no direction, or links have other lengths than before.
         """
         assert self.zero is not None, "the arm has no zero pose"
         ends = link_ends_from_shoulder(
@@ -143,27 +147,36 @@ class LiveArm:
         length = np.linalg.norm(span, axis=1, keepdims=True)
         if length.min() < _SHORTEST:
             raise ValueError("points: expected those of a link apart")
+        if self.lengths is not None and np.any(np.abs(length[:, 0] - self.lengths) > _CHANGED * self.lengths):
+            raise ValueError("points: expected link lengths as in the first samples, got others")
         return ball_chain_pose(span / length, self.zero)
 
 
-def find_live_arms(sample: Sample, unit: str, *, up: str = "z") -> dict[str, ArmPoints]:
-    """The arms among the points of a sample, by their names.
+def live_body(
+    sample: Sample, unit: str = "", *, up: str = "", subject: str = "", arm: ArmPoints | None = None
+) -> PointMotion:
+    """The points of a person in a sample, with an arm that is found by their names.
 
     Args:
       sample: the sample.
       unit: "" for metres, which are then checked against the length of an adult's arm.
-      up: axis that points up.
+      up: axis that points up; "" for z, which is then checked against the body.
+      subject, arm: see `read_motion`.
 
     Raises:
-      ValueError: no arm is complete, or the points are not in metres.
+      ValueError: no arm has all names, or the points are not in metres or have another axis up.
     """
     names = tuple(sample.points)
     positions = np.array([[sample.points[name] for name in names]]).reshape(1, len(names), 3)
-    body = PointMotion(names, (_NO_PARENT,) * len(names), z_up(positions, up), 1.0)
+    body = PointMotion(names, (_NO_PARENT,) * len(names), z_up(positions, up or "z"), 1.0)
+    body = with_arm(one_person(body, subject), arm)
     arms = find_arms(body)
-    complete = {side: arm for side, arm in arms.items() if np.isfinite(arm_length(body, arm))} if arms else {}
     if not arms:
-        raise ValueError(f"points: expected shoulder, elbow and wrist of an arm by their names, got {_few(names)}")
+        raise ValueError(f"points: {unnamed(body)}")
+    found, how = find_up(body, "z")
+    if not up and found != "z":
+        raise ValueError(f"points: expected z up, got {found} {how}; capture.up= states it")
+    complete = {side: arm for side, arm in arms.items() if np.isfinite(arm_length(body, arm))}
     fitting = guessed_units(body, complete) if complete else ["m"]
     if not unit and fitting != ["m"]:
         lengths = ", ".join(f"{arm_length(body, arm):.4g}" for arm in complete.values())
@@ -171,8 +184,4 @@ def find_live_arms(sample: Sample, unit: str, *, up: str = "z") -> dict[str, Arm
         raise ValueError(
             f"points: expected metres, got arms {lengths} long, as an adult's {known}; capture.unit= sets the unit"
         )
-    return arms
-
-
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "") if names else "none"
+    return body

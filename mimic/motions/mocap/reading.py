@@ -69,7 +69,7 @@ def read_motion(
             check_choice(name, value, choices)
     try:
         table = _read(source, suffix)
-        motion = _with_arm(_one_person(_even(_in_seconds(table)), subject), arm)
+        motion = with_arm(one_person(_even(_in_seconds(table)), subject), arm)
         stated = _stated(table.unit, UNITS)
         if stated and not unit:
             _check_stated(motion, stated)
@@ -174,8 +174,12 @@ def _check_stated(motion: PointMotion, unit: str) -> None:
         )
 
 
-def _one_person(motion: PointMotion, subject: str) -> PointMotion:
-    """The points of one of several persons, with those that are no other person's."""
+def one_person(motion: PointMotion, subject: str) -> PointMotion:
+    """The points of one of several persons, with those that are no other person's; see `read_motion`.
+
+    Raises:
+      ValueError: there is no such person.
+    """
     found = persons(motion)
     if subject and subject not in found:
         raise ValueError(f"subject: expected one of {', '.join(map(repr, found)) or 'none'}, got {subject!r}")
@@ -187,8 +191,12 @@ def _one_person(motion: PointMotion, subject: str) -> PointMotion:
     return _noted(motion, f"persons: {', '.join(found)}, of which {chosen} is read (capture.subject=)")
 
 
-def _with_arm(motion: PointMotion, arm: ArmPoints | None) -> PointMotion:
-    """The motion with the points of an arm that the user names."""
+def with_arm(motion: PointMotion, arm: ArmPoints | None) -> PointMotion:
+    """The motion with the points of an arm that the user names; see `read_motion`.
+
+    Raises:
+      ValueError: there is no such point, or the arm is not complete.
+    """
     if arm is None:
         return motion
     named = [tuple(_full_name(motion, name) for name in group) for group in arm[1:]]

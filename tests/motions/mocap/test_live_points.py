@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from mimic.motions.mocap.arms import find_arms
 from mimic.motions.mocap.ball_chain import ball_chain_motion, ball_chain_pose, ball_chain_xml, zero_frames
 from mimic.motions.mocap.link_motion import arm_motion, motion_states
-from mimic.motions.mocap.live_points import LiveArm, Sample, find_live_arms, parse_sample, sample_line
+from mimic.motions.mocap.live_points import LiveArm, Sample, live_body, parse_sample, sample_line
 from mimic.motions.mocap.points import PointMotion
 from tests.helpers.bodies import RATE, person
 
@@ -27,7 +28,7 @@ def samples(body):
 @pytest.fixture(scope="module")
 def arm(samples):
     """The right arm, turned, on a trunk."""
-    arm = LiveArm(find_live_arms(samples[0], ""), "right", 1.0, "z", 0.2, TURN)
+    arm = LiveArm(find_arms(live_body(samples[0])), "right", 1.0, "z", 0.2, TURN)
     return dataclasses.replace(arm, zero=zero_frames(arm.motion(samples)))
 
 
@@ -98,18 +99,40 @@ def test_a_pose_turns_no_link_about_itself(arm, samples):
 
 def test_other_units_and_axes(samples):
     y_up_mm = [Sample(s.time, {n: 1000 * p[[1, 2, 0]] for n, p in s.points.items()}) for s in samples]
-    expected = LiveArm(find_live_arms(samples[0], ""), "left", 1.0, "z", 0.0, (0.0, 0.0, 0.0)).motion(samples)
-    arm = LiveArm(find_live_arms(y_up_mm[0], "mm", up="y"), "left", 0.001, "y", 0.0, (0.0, 0.0, 0.0))
+    expected = LiveArm(find_arms(live_body(samples[0])), "left", 1.0, "z", 0.0, (0.0, 0.0, 0.0)).motion(samples)
+    arm = LiveArm(find_arms(live_body(y_up_mm[0], "mm", up="y")), "left", 0.001, "y", 0.0, (0.0, 0.0, 0.0))
     np.testing.assert_allclose(arm.motion(y_up_mm).end, expected.end, atol=1e-9)
     with pytest.raises(ValueError, match="expected metres, got arms 530, 530 long, as an adult's in mm; capture.unit="):
-        find_live_arms(y_up_mm[0], "", up="y")
+        live_body(y_up_mm[0], "", up="y")
 
 
 def test_points_without_an_arm(samples):
-    with pytest.raises(ValueError, match="expected shoulder, elbow and wrist of an arm by their names, got nose, a"):
-        find_live_arms(Sample(0.0, {"nose": np.zeros(3), "a": np.zeros(3)}), "")
-    with pytest.raises(ValueError, match="got none"):
-        find_live_arms(Sample(0.0, {}), "")
+    with pytest.raises(ValueError, match="points: no arm was found .* of nose, a"):
+        live_body(Sample(0.0, {"nose": np.zeros(3), "a": np.zeros(3)}), "")
+    with pytest.raises(ValueError, match="of none"):
+        live_body(Sample(0.0, {}), "")
+
+
+def test_live_points_with_another_axis_up(samples):
+    y_up = Sample(0.0, {name: point[[1, 2, 0]] for name, point in samples[0].points.items()})
+    with pytest.raises(ValueError, match="points: expected z up, got y from the feet to the head; capture.up="):
+        live_body(y_up)
+    assert live_body(y_up, up="y").names == tuple(y_up.points)
+
+
+def test_the_points_of_one_of_two_people(samples):
+    points = {f"{who}_{name}": point for who in ("Ann", "Bob") for name, point in samples[0].points.items()}
+    arms = find_arms(live_body(Sample(0.0, points), subject="bob"))
+    assert arms["right"].shoulder == ("Bob_RightArm",)
+
+
+def test_link_lengths_are_checked_in_each_sample(arm, samples):
+    measured = dataclasses.replace(arm, lengths=arm.motion(samples[:3]).link_lengths)
+    measured.pose(samples[9])
+    points = dict(samples[9].points)
+    points["RightHand"] = 2 * points["RightHand"] - points["RightForeArm"]
+    with pytest.raises(ValueError, match="expected link lengths as in the first samples"):
+        measured.pose(Sample(0.0, points))
 
 
 def test_points_that_are_not_seen_or_coincide(arm, samples):
@@ -125,7 +148,7 @@ def test_points_that_are_not_seen_or_coincide(arm, samples):
 def test_a_body_is_not_needed(samples):
     """The points of the arm alone suffice; forward is then the x-axis of the points."""
     points = {name: samples[0].points[name] for name in ("RightArm", "RightForeArm", "RightHand")}
-    arms = find_live_arms(Sample(0.0, points), "")
+    arms = find_arms(live_body(Sample(0.0, points)))
     assert set(arms) == {"right"}
     links = LiveArm(arms, "right", 1.0, "z", 0.0, (0.0, 0.0, 0.0)).motion([Sample(0.0, points)])
     np.testing.assert_allclose(links.end[0, 0], points["RightForeArm"] - points["RightArm"], atol=1e-12)
