@@ -24,6 +24,13 @@ def write_motions(folder: Path) -> None:
     np.savez_compressed(folder / "imported.npz", **arrays)  # type: ignore[arg-type]
     names = ",".join(("time", *ARM.joint_names))
     np.savetxt(folder / "imported.csv", np.column_stack([time_, qpos]), delimiter=",", header=names, comments="")
+    if importlib.util.find_spec("h5py"):
+        import h5py
+
+        model = "".join(f'<body><joint name="{name}"/></body>' for name in ARM.joint_names)
+        with h5py.File(folder / "imported.hdf5", "w") as file:
+            file["demo_1/states"] = np.column_stack([time_, qpos, 0 * qpos])
+            file["demo_1"].attrs["model_file"] = f"<mujoco><worldbody>{model}</worldbody></mujoco>"
     np.savetxt(folder / "correspondence.csv", rng.random((3, 3)), "%.3f", delimiter=",")
     several = np.stack([qpos, -qpos])
     Demonstrations(several, 0 * several, several[:, -1], 0.1, ARM.name, ARM.joint_names).save(folder / "recorded.npz")
