@@ -18,7 +18,6 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -41,6 +40,7 @@ from mimic.motions.mocap.link_motion import TRUNK, LinkMotion
 from mimic.retargeting.pose_baselines import hand_ik, hold_home
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig
+from mimic.trainers.pose_mapper.mapper_arm import MapperArm
 from mimic.trainers.pose_mapper.model import MapperModel
 from mimic.trainers.pose_mapper.training import mapper_objective, train
 
@@ -109,7 +109,8 @@ def with_cut_links(case: Case) -> Case:
 def mapped(case: Case) -> np.ndarray:
     """Poses of a mapper that was trained on the same poses."""
     settings = _MAPPER.resolve()
-    model = MapperModel(case.expert, case.learner, METRIC, settings)
+    arms = (MapperArm.constant(arm) for arm in (case.expert, case.learner))
+    model = MapperModel(EnvConfig(metric=METRIC), settings, *arms)
     shuffled = np.random.default_rng(0).permutation(len(case.qpos))
     poses = jnp.asarray(case.qpos[np.resize(shuffled, settings.samples)], jnp.float32)
     with tempfile.TemporaryDirectory() as folder:
@@ -122,7 +123,7 @@ def mapped(case: Case) -> np.ndarray:
             on_evaluation=lambda *_: False,
             signals=Signals(),
         )
-    return np.asarray(jax.vmap(lambda qpos: model(params, qpos))(jnp.asarray(case.qpos, jnp.float32)))
+    return np.asarray(model.of_poses(params, jnp.asarray(case.qpos, jnp.float32), None, None))
 
 
 METHODS: dict[str, Callable[[Case], np.ndarray | None]] = {

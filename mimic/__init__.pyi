@@ -54,8 +54,8 @@ from .retargeting.pose import PoseImitation as PoseImitation
 from .retargeting.pose import imitate_pose as imitate_pose
 from .retargeting.trajectory import imitate_trajectory as imitate_trajectory
 from .trainers.export.export import export_run as export_run
-from .trainers.pose_mapper.any_arm_mapper import AnyArmMapper as AnyArmMapper
-from .trainers.pose_mapper.model import PoseMapper as PoseMapper
+from .trainers.pose_mapper.mapper import AnyArmMapper as AnyArmMapper
+from .trainers.pose_mapper.mapper import PoseMapper as PoseMapper
 from .trainers.pretrained.network import Pretrained as Pretrained
 from .trainers.pretrained.network import load as load
 

@@ -14,7 +14,7 @@ from benchmarks.figures.poses import FIGURES, save_figure
 from mimic.envs import env_config
 from mimic.trainers import run_training
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
-from mimic.trainers.pose_mapper.model import PoseMapper
+from mimic.trainers.pose_mapper.mapper import PoseMapper
 
 
 def load_mapper(env: str, run_dir: Path) -> PoseMapper:

@@ -27,7 +27,7 @@ from mimic.metric.correspondence import hard_correspondence, overlap_corresponde
 from mimic.metric.distance import DistanceWeights, adaptive_weights  # noqa: E402
 from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
 from mimic.retargeting.pose import imitate_pose  # noqa: E402
-from mimic.trainers.pose_mapper.model import PoseMapper  # noqa: E402
+from mimic.trainers.pose_mapper.mapper import PoseMapper  # noqa: E402
 
 LoadMapper = Callable[[str], PoseMapper]  # from the name of an environment
 
@@ -102,7 +102,7 @@ def draw_planar(load_mapper: LoadMapper) -> Any:
         expert, learner = mapper.expert, mapper.learner
         rng = np.random.default_rng(7)  # half the range trained on, so that arms overlap less
         poses = rng.uniform(-0.5 * np.pi, 0.5 * np.pi, (columns, expert.num_joints)).astype(np.float32)
-        match = mapper.model.metric.match_links(expert, learner)
+        match = mapper.env.metric.match_links(expert, learner)
         mapped, optimal, excess = _mapped_and_optimal(mapper, poses)
         for axes, pose, learner_qpos, best, percent in zip(row, poses, mapped, optimal, excess, strict=True):
             draw_match(axes, match, pose, learner_qpos)
@@ -123,7 +123,7 @@ def draw_panda(load_mapper: LoadMapper) -> Any:
     expert = env_config(names[0]).expert
     figure, rows = plt.subplots(len(names) + 1, len(_PANDA_POSES), figsize=(7.6, 10.2), layout="constrained")
     mappers = {name: load_mapper(name) for name in names}
-    matches = {name: mapper.model.metric.match_links(mapper.expert, mapper.learner) for name, mapper in mappers.items()}
+    matches = {name: mapper.env.metric.match_links(mapper.expert, mapper.learner) for name, mapper in mappers.items()}
     colours = matches[names[0]].expert_colours
     with ArmScene([expert], width=_PIXELS, height=_PIXELS, colours=[colours]) as scene:
         scene.fit([_PANDA_POSES])
@@ -179,7 +179,7 @@ def save_figure(name: str, out: Path, load_mapper: LoadMapper) -> list[Path]:
 
 def _mapped_and_optimal(mapper: PoseMapper, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses of the mapper and of the optimiser, and the mapper's excess distance [% of that of random poses]."""
-    metric, expert, learner = mapper.model.metric, mapper.expert, mapper.learner
+    metric, expert, learner = mapper.env.metric, mapper.expert, mapper.learner
     mapped = np.asarray(mapper(poses))
     optimal = imitate_pose(expert, learner, poses, **metric.build(expert, learner).arguments)
     distance = functools.partial(_distances, mapper, poses)
@@ -191,4 +191,4 @@ def _mapped_and_optimal(mapper: PoseMapper, poses: np.ndarray) -> tuple[np.ndarr
 
 
 def _distances(mapper: PoseMapper, poses: np.ndarray, learner_poses: Any) -> np.ndarray:
-    return np.asarray(jax.jit(jax.vmap(mapper.model.distance))(poses, jnp.asarray(learner_poses, jnp.float32)))
+    return np.asarray(jax.jit(jax.vmap(mapper.distance))(poses, jnp.asarray(learner_poses, jnp.float32)))

@@ -61,6 +61,11 @@ class Background(Generic[T]):
             self._future = executor.submit(self._make)
             executor.shutdown(wait=False)
 
+    @property
+    def done(self) -> bool:
+        """Whether the computation has ended, or failed."""
+        return self._future is not None and self._future.done()
+
     def __call__(self) -> T:
         """Returns the value, after waiting for it."""
         if self._future is None:

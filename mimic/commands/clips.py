@@ -25,7 +25,7 @@ from mimic.motions.recording import record_demonstrations
 from mimic.retargeting.pose import imitate_pose
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.make import make_policy_trainer
-from mimic.trainers.pose_mapper.any_arm_mapper import load_mapper, one_learner
+from mimic.trainers.pose_mapper.mapper import load_mapper
 from mimic.trainers.run_config import load_config, policy_run
 
 FRAMES_PER_SECOND = 30
@@ -131,8 +131,8 @@ def _mapper_clip(config: RenderConfig) -> ClipPlan:
     """A demonstration of the expert, and the pose of the pose mapper at each frame."""
     _check_unused(config, "a run of trainer=pose_mapper", "split", "learner", "locked", "expert", "limits")
     run_dir = Path(config.run).expanduser()
-    env = one_learner(load_config(run_dir).env)
     mapper = load_mapper(run_dir, config.checkpoint)
+    env = dataclasses.replace(mapper.env, arms=None)
     if config.demonstrations:
         _check_unused(config, "demonstrations=FILE", "seed")
         demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())

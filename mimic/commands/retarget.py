@@ -1,6 +1,5 @@
 """`python -m mimic.retarget`: demonstrations of one arm as motions of another, pose by pose."""
 
-import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,8 +23,7 @@ from mimic.motions.demonstrations import Demonstrations, load_demonstrations
 from mimic.retargeting.costs import Costs
 from mimic.retargeting.motions import largest_jump, optimal_motions
 from mimic.retargeting.pose import wrap_angles
-from mimic.trainers.pose_mapper.any_arm_mapper import load_mapper
-from mimic.trainers.pose_mapper.model import PoseMapper
+from mimic.trainers.pose_mapper.mapper import PoseMapper, load_mapper
 from mimic.trainers.progress import similarity_table
 
 
@@ -114,10 +112,9 @@ def follow_mapper(
       The learner's poses [motions, time, learner_joints] [rad], their distances [motions, time], and whether each pose
       equals the proposed one [motions, time].
     """
-    model = mapper.model
-    candidates = jax.jit(jax.vmap(jax.vmap(functools.partial(model.candidates, mapper.params))))(qpos)
-    distances = jax.jit(jax.vmap(jax.vmap(jax.vmap(model.distance, (None, 0)))))(qpos, candidates)
-    continuous = continuous_joints(model.learner)
+    candidates = jax.jit(jax.vmap(jax.vmap(mapper.candidates)))(qpos)
+    distances = jax.jit(jax.vmap(jax.vmap(jax.vmap(mapper.distance, (None, 0)))))(qpos, candidates)
+    continuous = continuous_joints(mapper.learner)
 
     def motion(candidates: Array, distances: Array) -> tuple[Array, Array]:
         selected = _select_candidates(candidates, distances, largest_jump, continuous)
@@ -132,7 +129,7 @@ def follow_mapper(
         return poses, settled
 
     poses, settled = jax.jit(jax.vmap(motion))(candidates, distances)
-    distance = jax.jit(jax.vmap(jax.vmap(model.distance)))(qpos, poses)
+    distance = jax.jit(jax.vmap(jax.vmap(mapper.distance)))(qpos, poses)
     return np.asarray(poses), np.asarray(distance), np.asarray(settled)
 
 

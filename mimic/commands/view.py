@@ -25,14 +25,14 @@ from mimic.commands.view_capture import (
 from mimic.commands.view_server import check_port, is_installed, serve
 from mimic.envs.config import EnvConfig
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.run_config import load_config, policy_run
+from mimic.trainers.run_config import policy_run
 from mimic.viewer.live_session import LiveSession
 
 if TYPE_CHECKING:
-    from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
+    from mimic.trainers.pose_mapper.mapper import PoseMapper
     from mimic.viewer.page import Page
     from mimic.viewer.playback import Playback
-    from mimic.viewer.tracking import Mapper, Preset
+    from mimic.viewer.tracking import Preset
 
 CAPTURE_RATE = 100.0  # frames per second of a captured person, at most
 _NUMBERS_RATE = 15.0  # per second, of the numbers, chart and maps, which cost a browser more than the arms
@@ -93,11 +93,11 @@ def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
       ValueError: there is no such mapper, or a learner does not exist or does not fit it.
     """
     from mimic.commands.view_any_arm import AnyLearnerFunctions, read_learners
-    from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
     from mimic.viewer.tracking import shown_preset
 
-    mapper, env = _load_mapper(config)
-    if not isinstance(mapper, AnyArmMapper):
+    mapper = _load_mapper(config)
+    env = mapper.env
+    if not mapper.takes_any_learner:
         if config.learners:
             raise ValueError(f"learners: expected none with mapper={config.mapper}, which has one learner")
         return _prepare_live(config, env, LiveSession(env, mapper))
@@ -110,25 +110,21 @@ def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
     return _prepare_live(config, env, session, drawn, presets)
 
 
-def _load_mapper(config: ViewConfig) -> "tuple[Mapper | AnyArmMapper, EnvConfig]":
-    """The mapper in `mapper`, and its environment.
+def _load_mapper(config: ViewConfig) -> "PoseMapper":
+    """The mapper in `mapper`: a run directory, or the name of one that comes with mimic.
 
     Raises:
-      ValueError: see `PoseMapper.load` and `AnyArmMapper.load`.
+      ValueError: see `PoseMapper.load`.
     """
-    from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
-    from mimic.trainers.pose_mapper.model import PoseMapper
-    from mimic.trainers.pretrained.network import Pretrained, load, pretrained_names
+    from mimic.trainers.pose_mapper.mapper import PoseMapper
+    from mimic.trainers.pretrained.network import NETWORKS, pretrained_names, read_network
 
     run_dir = Path(config.mapper).expanduser()
-    if config.mapper in pretrained_names("pose_mapper") and not run_dir.exists():
-        if config.checkpoint is not None:
-            raise ValueError(f"checkpoint: expected none with mapper={config.mapper}, which comes with mimic")
-        network = load(config.mapper, "pose_mapper")
-        return (network.function, network.config.env) if isinstance(network, Pretrained) else (network, network.env)
-    env = load_config(run_dir).env
-    load_run = AnyArmMapper.load if env.kind == "sampled_arms" else PoseMapper.load
-    return load_run(run_dir, config.checkpoint), env
+    if config.mapper not in pretrained_names("pose_mapper") or run_dir.exists():
+        return PoseMapper.load(run_dir, config.checkpoint)
+    if config.checkpoint is not None:
+        raise ValueError(f"checkpoint: expected none with mapper={config.mapper}, which comes with mimic")
+    return read_network(NETWORKS / f"{config.mapper}-pose_mapper", "pose_mapper").function
 
 
 def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:

@@ -1,11 +1,10 @@
 """Functions that move and measure any learner, compiled once: the arm, its locks and the weights are arguments."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from concurrent.futures import wait as wait_for
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +13,12 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
-from mimic.metric.correspondence import arc_length_correspondence
-from mimic.metric.distance import DistanceWeights, Metric
+from mimic.base.compilation import in_background
+from mimic.metric.distance import DistanceWeights
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line, similarity
-from mimic.retargeting.array_nearest import nearest_pose
-from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
-from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, expert_pose
-from mimic.trainers.pose_mapper.any_arm_training import random_pose
+from mimic.trainers.pose_mapper.mapper import PoseMapper
+from mimic.trainers.pose_mapper.pair import Pair, Target, random_poses
 from mimic.viewer.tracking import CompiledFunctions, PoseComparison, Preset, Settings, compiled
 
 # The kinematic bound: Newton steps from random poses, home and the mapper's pose. On Pandas with locked joints and on
@@ -83,20 +80,6 @@ def read_learners(
     return tuple(arms), tuple(presets)
 
 
-class _Compiled(NamedTuple):
-    """Compiled functions of padded poses [rad], the weights (translation, rotation) and a learner.
-
-    Attributes:
-      track: (expert_qpos, weights, learner) -> the mapper's pose [rad].
-      compare: (expert_qpos, learner_qpos, weights, learner) -> `PoseComparison`, with empty slots of links.
-      best: (expert_qpos, guess, weights, learner) -> the best pose [rad], and its distance.
-    """
-
-    track: Callable[..., Array]
-    compare: Callable[..., PoseComparison]
-    best: Callable[..., tuple[Array, Array]]
-
-
 class AnyLearnerFunctions:
     """The functions of all learners with any of their joints locked, compiled once in a background thread.
 
@@ -105,79 +88,76 @@ class AnyLearnerFunctions:
       learners: that can be chosen.
     """
 
-    def __init__(self, mapper: AnyArmMapper, learners: Sequence[AnyLearner]):
+    def __init__(self, mapper: PoseMapper, learners: Sequence[AnyLearner]):
         self._expert, self._learners = mapper.expert, learners
-        executor = ThreadPoolExecutor(1, "compile")
-        self._compiled = executor.submit(_compile, mapper)
-        executor.shutdown(wait=False)
+        self._compiled = in_background(lambda: _compile(mapper))
 
     def get(self, settings: Settings) -> CompiledFunctions | None:
         """The functions; None until they are compiled."""
-        return self.wait(settings) if self._compiled.done() else None
+        return self.wait(settings) if self.is_complete(settings) else None
 
     def is_complete(self, settings: Settings) -> bool:
         """Whether the functions are compiled, or their compilation has failed."""
-        return self._compiled.done()
+        del settings
+        return self._compiled.done
 
     def wait(self, settings: Settings) -> CompiledFunctions:
         """Waits for the functions and returns them."""
-        functions, learner = self._compiled.result(), self._learners[settings.arm]
+        (to_mapped, to_comparison, to_best), learner = self._compiled(), self._learners[settings.arm]
         arrays, joints = learner.with_locks(settings.locked), learner.arm.embodiment.num_joints
         links = self._expert.num_links, learner.arm.embodiment.num_links
 
         def track(qpos: Array, current: Array, weights: Array) -> np.ndarray:
-            return np.asarray(functions.track(_padded(qpos), weights, arrays))[:joints]
+            return np.asarray(to_mapped(_padded(qpos), weights, arrays))[:joints]
 
         def compare(qpos: Array, learner_qpos: Array, weights: Array) -> PoseComparison:
-            comparison = functions.compare(_padded(qpos), _padded(learner_qpos), weights, arrays)
+            comparison = to_comparison(_padded(qpos), _padded(learner_qpos), weights, arrays)
             return _without_empty_slots(comparison, *links)
 
         def best(qpos: Array, weights: Array) -> tuple[np.ndarray, Array]:
-            expert_qpos = _padded(qpos)
-            guess = functions.track(expert_qpos, weights, arrays)
-            nearest, distance = functions.best(expert_qpos, guess, weights, arrays)
+            distance, nearest = to_best(_padded(qpos), to_mapped(_padded(qpos), weights, arrays), weights, arrays)
             return np.asarray(nearest)[:joints], distance
 
         return CompiledFunctions(learner.arm, track, compare, best)
 
     def finish(self) -> None:
         """Waits for the compilation: a process must not end during it."""
-        wait_for([self._compiled])
+        with contextlib.suppress(Exception):  # raised by `wait`
+            self._compiled()
 
 
-def _compile(mapper: AnyArmMapper) -> _Compiled:
-    def model_of(weights: Array) -> AnyArmMapperModel:
-        return dataclasses.replace(mapper.model, weights=DistanceWeights(weights[0], weights[1]))
+def _compile(mapper: PoseMapper) -> tuple[Callable[..., Any], ...]:
+    """Compiled functions of padded poses [rad], the weights (translation, rotation) and a learner.
+
+    The mapper's pose (expert_qpos, weights, learner); a `PoseComparison` with empty slots of links (expert_qpos,
+    learner_qpos, weights, learner); the smallest distance and its pose (expert_qpos, guess, weights, learner).
+    """
+    model, expert = mapper.model, mapper.model.expert.data
+
+    def target_of(qpos: Array, weights: Array, learner: ArmArrays) -> Target:
+        return Pair.of_arrays(expert, learner, DistanceWeights(weights[0], weights[1])).target(qpos)
 
     def track(qpos: Array, weights: Array, learner: ArmArrays) -> Array:
-        return model_of(weights)(mapper.params, expert_pose(mapper.model.expert, qpos), learner)
+        return model(mapper.params, target_of(qpos, weights, learner))
 
     def compare(qpos: Array, learner_qpos: Array, weights: Array, learner: ArmArrays) -> PoseComparison:
-        expert, matrix = mapper.model.expert, arc_length_correspondence(mapper.model.expert, learner)
-        metric = Metric(matrix, model_of(weights).weights)
-        links = metric.link_distances(link_states(expert, qpos), link_states(learner, learner_qpos))
+        target = target_of(qpos, weights, learner)
+        metric = target.pair.metric
+        links = metric.link_distances(target.states, link_states(learner, learner_qpos))
         lines = centre_line(expert, qpos), centre_line(learner, learner_qpos)
-        return PoseComparison(metric.reduced(links), matrix, links, similarity(*lines))
+        return PoseComparison(metric.reduced(links), metric.matrix(links), links, similarity(*lines))
 
     def best(qpos: Array, guess: Array, weights: Array, learner: ArmArrays) -> tuple[Array, Array]:
-        model, expert = model_of(weights), expert_pose(mapper.model.expert, qpos)
-        matrix, keys = arc_length_correspondence(model.expert, learner), jax.random.split(jax.random.key(0), _GUESSES)
-        random = jax.vmap(lambda key: random_pose(learner, key))(keys)
-        guesses = jnp.concatenate([random, jnp.stack([jnp.asarray(learner.home), guess])])
-        poses = jax.vmap(lambda at: nearest_pose(learner, model.weights, matrix, expert.states, at, _STEPS).qpos)(
-            guesses
-        )
-        poses = jnp.concatenate([poses, guess[None]])  # the steps have no line search
-        distances = model.distances(expert, learner, poses)
-        nearest = jnp.argmin(distances)
-        return poses[nearest], distances[nearest]
+        target, keys = target_of(qpos, weights, learner), jax.random.split(jax.random.key(0), _GUESSES)
+        random = jax.vmap(lambda key: random_poses(learner, key))(keys)
+        poses = target.improved(jnp.concatenate([random, jnp.stack([jnp.asarray(learner.home), guess])]), _STEPS)
+        return target.nearest(jnp.concatenate([poses, guess[None]]))  # the steps have no line search
 
-    learner = mapper.model.expert  # any other arm has the same shapes
-    pose, weights = np.zeros(MAX_JOINTS, np.float32), np.ones(2, np.float32)
-    return _Compiled(
-        compiled(track, pose, weights, learner),
-        compiled(compare, pose, pose, weights, learner),
-        compiled(best, pose, pose, weights, learner),
+    pose, weights = np.zeros(MAX_JOINTS, np.float32), np.ones(2, np.float32)  # any other arm has the expert's shapes
+    return (
+        compiled(track, pose, weights, expert),
+        compiled(compare, pose, pose, weights, expert),
+        compiled(best, pose, pose, weights, expert),
     )
 
 

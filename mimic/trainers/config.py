@@ -213,7 +213,7 @@ class PoseMapperConfig(TrainerConfig):
     """The neural pose mapper. A field that is None takes its value from the preset.
 
     If the environment draws its learner (`env.arms`), one network maps to all of these arms: see
-    `mimic.trainers.pose_mapper.any_arm_model`. It has `width`, `layers`, `guesses` and `refinements`, and neither
+    `mimic.trainers.pose_mapper.networks`. It has `width`, `layers`, `guesses` and `refinements`, and neither
     `inputs`, `outputs`, `hidden_layers` nor `activation`. A training pose is then a pose of the expert and
     an arm, and with `env.arms.expert=drawn` the expert is another arm for each pose too.
 

@@ -93,13 +93,8 @@ def _make_ppo_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
 
 
 def _make_pose_mapper_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
-    if config.env.kind == "sampled_arms":
-        from mimic.trainers.pose_mapper.any_arm_trainer import AnyArmMapperTrainer
-
-        return AnyArmMapperTrainer(config, run_dir)
     from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
 
-    config.env.check_one_learner()
     return PoseMapperTrainer(config, run_dir)
 
 

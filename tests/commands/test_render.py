@@ -81,11 +81,11 @@ def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
     np.testing.assert_allclose(expert[::EVERY], recorded.qpos[1], atol=1e-6)
     np.testing.assert_allclose(learner, mapper(expert.astype(np.float32)), atol=ROUNDING)
     shown = curves(clip)
-    expected = jax.vmap(mapper.model.distance)(jnp.asarray(expert), jnp.asarray(learner))
+    expected = jax.vmap(mapper.distance)(jnp.asarray(expert), jnp.asarray(learner))
     np.testing.assert_allclose(shown["pose mapper"], expected, atol=ROUNDING)
     np.testing.assert_allclose(clip.bars.sum(axis=1), shown["pose mapper"], atol=ROUNDING)
     assert np.all(shown["optimal poses"] <= np.minimum(shown["pose mapper"], shown["holding the start pose"]) + 1e-3)
-    stretched = mapper.model.distance(jnp.zeros(7), jnp.zeros(4))
+    stretched = mapper.distance(jnp.zeros(7), jnp.zeros(4))
     assert shown["holding the start pose"][0] == pytest.approx(float(stretched), abs=ROUNDING)
 
 

@@ -73,6 +73,8 @@ def test_a_run_reports_what_it_trained_with(trained):
     run_dir, report = trained
     assert report.keys() >= REPORT_KEYS
     assert report["quality"]["held_out"] < 1  # better than random poses
+    ((name, arm),) = report["arms"].items()
+    assert name == "planar2" and arm["joints"] == 2 and arm["quality"] == report["quality"]["held_out"]
     assert report["training_poses"] == SHORT["samples"] * SHORT["epochs"]
     assert {"config.yaml", "report.json", "metrics.csv", "training.png"} <= {path.name for path in run_dir.iterdir()}
 
@@ -99,15 +101,15 @@ def test_a_loaded_mapper_takes_one_pose_or_many(trained):
     np.testing.assert_allclose(batch, jax.vmap(mapper)(qpos), atol=1e-5)
     np.testing.assert_allclose(mapper(qpos.reshape(3, 4, -1)), batch.reshape(3, 4, -1), atol=1e-5)
     np.testing.assert_allclose(mapper(qpos + 2 * np.pi), batch, atol=1e-3)  # a full turn is the same pose
-    distance = jax.vmap(mapper.model.distance)(jnp.asarray(qpos), batch)
+    distance = jax.vmap(mapper.distance)(jnp.asarray(qpos), batch)
     assert np.mean(distance) < report["random_distance"]["held_out"]
 
 
 def test_the_nearest_head_is_taken(trained):
     mapper = mimic.PoseMapper.load(trained[0])
     qpos = jnp.asarray(poses(mapper, 5)[2])
-    candidates = jax.jit(mapper.model.candidates)(mapper.params, qpos)
-    distances = jax.jit(jax.vmap(mapper.model.distance, (None, 0)))(qpos, candidates)
+    candidates = jax.jit(mapper.candidates)(qpos)
+    distances = jax.jit(jax.vmap(mapper.distance, (None, 0)))(qpos, candidates)
     np.testing.assert_allclose(jax.jit(mapper)(qpos), candidates[int(np.argmin(distances))], atol=1e-6)
 
 
@@ -158,12 +160,13 @@ def test_the_paper_overfits_and_early_stopping_goes_back_to_the_best(tmp_path):
 def test_evaluation_poses_are_not_training_poses(tmp_path):
     jobs = [PoseMapperTrainer(run_config(tmp_path, seed=seed).resolve()) for seed in (0, 1)]
     for job in jobs:
-        training_poses = np.asarray(job._poses["train"])
-        for split in ("validation", "held_out"):
-            unseen = np.asarray(job._poses[split])
+        training_poses = np.asarray(job.samples["train"])
+        of_report = np.asarray(job.pairs["arms"].expert_qpos)[-FEW["held_out_poses"] :]
+        for unseen in (np.asarray(job.samples["validation"]), of_report):
             assert not (unseen[:, None] == training_poses[None, :512]).all(axis=-1).any()
-    np.testing.assert_array_equal(jobs[0]._poses["held_out"], jobs[1]._poses["held_out"])
-    assert not np.array_equal(jobs[0]._poses["train"], jobs[1]._poses["train"])
+    few = FEW["validation_poses"]
+    np.testing.assert_array_equal(*(job.pairs["arms"].expert_qpos[few:] for job in jobs))
+    assert not np.array_equal(*(job.pairs["arms"].expert_qpos[:few] for job in jobs))
 
 
 @pytest.mark.slow
@@ -220,6 +223,8 @@ def test_bad_poses_are_rejected(trained, qpos, message):
 
 def test_a_mapper_of_other_arms_or_of_no_run_is_rejected(trained, tmp_path):
     mapper = mimic.PoseMapper.load(trained[0])
+    with pytest.raises(ValueError, match="learner: expected none, because this mapper has a fixed one, planar2"):
+        mapper.to("panda")
     mapper.check_fits(mapper.expert, mapper.learner)
     with pytest.raises(ValueError, match="its learner is planar2"):
         mapper.check_fits(mapper.expert, mimic.panda())

@@ -26,7 +26,7 @@ from mimic.trainers.export.export_controller import prepare_controller
 from mimic.trainers.export.functions import ExportedFunction, make_function
 from mimic.trainers.export.onnx_model import to_onnx
 from mimic.trainers.fine_tuning import with_one_learner
-from mimic.trainers.pose_mapper.any_arm_mapper import describe_arm
+from mimic.trainers.pose_mapper.mapper_arm import describe_arm
 from mimic.trainers.run_config import load_config
 
 # The packages that write each format.
@@ -203,13 +203,13 @@ def _write_description(trained: TrainConfig, learner: str, locked: Sequence[Any]
     elif locked:
         arm = ArmConfig(model=learner, locked=list(locked))
     described = describe_arm(env, arm)
-    arrays = described.arrays
+    arrays = described.data
     if is_policy:  # the function would need many times as many operations with the inertia in the home pose
         max_torque = torque_scale(jax.tree.map(jnp.asarray, arrays), env.action_scale, env.control_dt)
         arrays = dataclasses.replace(arrays, torque_limit=np.asarray(max_torque))
 
     def run() -> None:
-        name = described.arm.embodiment.name
+        name = described.embodiment.name
         save_description(file, arrays, name, described.slots, has_dynamics=is_policy)
         Console().print(f"results: {file}", soft_wrap=True, highlight=False)
 

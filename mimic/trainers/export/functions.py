@@ -25,9 +25,7 @@ from mimic.metric.kinematics import link_states
 from mimic.retargeting.array_goals import NEW_POSES, OTHERS, Problem, chosen_goal, first_goals, next_goals
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
-from mimic.trainers.pose_mapper.any_arm_model import expert_pose
-from mimic.trainers.pose_mapper.model import PoseMapper
+from mimic.trainers.pose_mapper.mapper import PoseMapper
 from mimic.trainers.ppo import ppo
 from mimic.trainers.ppo.trainer import run_environment
 
@@ -66,14 +64,8 @@ def make_function(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFu
       run_dir: run directory.
       steps: of the checkpoint, which exists.
     """
-    is_any_arm, is_policy = trained.env.kind == "sampled_arms", trained.trainer.name == "ppo"
-    make = {
-        (False, False): _mapper,
-        (False, True): _policy,
-        (True, False): _any_arm_mapper,
-        (True, True): _any_arm_policy,
-    }[is_any_arm, is_policy]
-    exported = make(trained, run_dir, steps)
+    of_policy = _any_arm_policy if trained.env.kind == "sampled_arms" else _policy
+    exported = (of_policy if trained.trainer.name == "ppo" else _mapper)(trained, run_dir, steps)
     common = {
         "mimic_version": VERSION,
         "env": trained.env.name,
@@ -115,39 +107,27 @@ def _policy(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFunction
 
 
 def _mapper(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFunction:
+    """A pose mapper; where it takes any learner, with the description of an arm as an input."""
     mapper = PoseMapper.load(run_dir, steps)
-    params = jax.device_get(mapper.params)
+    model, params, expert = mapper.model, jax.device_get(mapper.params), mapper.model.expert
 
-    def function(qpos: jax.Array) -> dict[str, jax.Array]:
-        return {"learner_qpos": mapper.model(params, qpos)}
+    def function(expert_qpos: jax.Array, learner: jax.Array | None = None) -> dict[str, jax.Array]:
+        pair = model.pair(None if learner is None else described_arm(learner))
+        return {"learner_qpos": model(params, pair.target(expert.in_slots(expert_qpos)))}
 
-    metadata = {
-        **_names(mapper.expert, mapper.learner),
+    metadata: dict[str, Any] = {
         "inputs": {"expert_qpos": "rad, in the order of expert_joints"},
-        "outputs": {"learner_qpos": "rad, in the order of learner_joints"},
         "expert_range": _joint_ranges(mapper.expert),
-        "learner_range": _joint_ranges(mapper.learner),
     }
-    return ExportedFunction(function, "pose_mapper", {"expert_qpos": mapper.expert.num_joints}, metadata)
-
-
-def _any_arm_mapper(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFunction:
-    mapper, env = AnyArmMapper.load(run_dir, steps), trained.env
-    params = jax.device_get(mapper.params)
-
-    def function(expert_qpos: jax.Array, learner: jax.Array) -> dict[str, jax.Array]:
-        expert = expert_pose(mapper.model.expert, mapper.own_expert.in_slots(expert_qpos))
-        return {"learner_qpos": mapper.model(params, expert, described_arm(learner))}
-
-    metadata = {
-        **_names(mapper.expert),
-        "inputs": {"expert_qpos": "rad, in the order of expert_joints", "learner": _LEARNER},
-        "outputs": {"learner_qpos": f"rad, {_ANGLES}"},
-        "expert_range": _joint_ranges(mapper.expert),
-        "learner_layout": description_layout(),
-    }
-    inputs = {"expert_qpos": mapper.expert.num_joints, "learner": description_size()}
-    samples = _arm_samples(inputs, arm_arrays(build_arm(env.expert, env.limits, env.metric.links)))
+    inputs = {"expert_qpos": mapper.expert.num_joints}
+    if model.learner is not None:
+        metadata |= _names(mapper.expert, mapper.learner) | {"learner_range": _joint_ranges(mapper.learner)}
+        metadata["outputs"] = {"learner_qpos": "rad, in the order of learner_joints"}
+        return ExportedFunction(function, "pose_mapper", inputs, metadata)
+    metadata |= _names(mapper.expert) | {"learner_layout": description_layout()}
+    metadata["inputs"]["learner"], metadata["outputs"] = _LEARNER, {"learner_qpos": f"rad, {_ANGLES}"}
+    inputs["learner"] = description_size()
+    samples = _arm_samples(inputs, expert.data)
     return ExportedFunction(function, "pose_mapper", inputs, metadata, samples, has_batch=False)
 
 

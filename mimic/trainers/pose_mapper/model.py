@@ -2,231 +2,154 @@
 
 import dataclasses
 import functools
-import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
-from jax.core import Tracer
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mimic.arms.embodiment import Embodiment
-from mimic.arms.pose_limits import continuous_joints, pose_limits
+from mimic.arms.arm import build_arm
+from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
 from mimic.base.compilation import on_host
 from mimic.envs.config import EnvConfig
-from mimic.metric.config import MetricConfig
-from mimic.metric.distance import Metric
-from mimic.metric.kinematics import link_states
-from mimic.retargeting.pose import checked_poses, wrap_angles
-from mimic.runs.checkpoints import load_checkpoint
+from mimic.metric.config import check_metric
+from mimic.metric.distance import DistanceWeights
 from mimic.trainers.config import PoseMapperConfig
-from mimic.trainers.pose_mapper.one_pair import OnePairModel
-from mimic.trainers.run_config import load_config
+from mimic.trainers.pose_mapper.mapper_arm import MapperArm
+from mimic.trainers.pose_mapper.networks import FullyConnected, JointTokens
+from mimic.trainers.pose_mapper.pair import Arm, Pair, Poses, Target, poses_within_range
 
 Params = Any
-PoseDistance = Callable[[Array, Array], Array]  # (expert's pose, learner's pose) -> distance
-
-_ACTIVATIONS = {"leaky_relu": nn.leaky_relu, "gelu": nn.gelu}
-_LIMIT_TOLERANCE = 1e-4  # rad: rounding to float32 moves a pose over its limit by less than this
-
-
-class _Network(nn.Module):
-    """A fully connected network."""
-
-    hidden_layers: tuple[int, ...]
-    outputs: int
-    activation: str
-
-    @nn.compact
-    def __call__(self, x: Array) -> Array:
-        for width in self.hidden_layers:
-            x = _ACTIVATIONS[self.activation](nn.Dense(width)(x))
-        return nn.Dense(self.outputs)(x)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MapperModel:
-    """A mapper without its parameters: pure functions of one pose.
+    """A mapper without its parameters: pure functions of one pose; batch with `jax.vmap`.
 
     Attributes:
-      expert: embodiment with n joints.
-      learner: embodiment with n_hat joints.
-      metric: config of the metric that defines the nearest pose and chooses among the heads.
+      env: its metric defines the nearest pose, and chooses among those that the network proposes.
       config: settings of the network.
+      expert: the environment's expert.
+      learner: the learner; None for any learner, whose description is then an input of the network.
     """
 
-    expert: Embodiment
-    learner: Embodiment
-    metric: MetricConfig
+    env: EnvConfig
     config: PoseMapperConfig
+    expert: MapperArm
+    learner: MapperArm | None
+
+    @property
+    def takes_any_expert(self) -> bool:
+        """Whether the expert may be any arm too."""
+        return self.learner is None and self.env.arms is not None and self.env.arms.expert == "drawn"
+
+    @property
+    def starts(self) -> int:
+        """Number of poses from which it takes Newton steps."""
+        return self.config.heads + (self.config.guesses or 0)
 
     @functools.cached_property
-    def _network(self) -> _Network:
-        outputs = self.config.heads * self.learner.num_joints * 2
-        hidden_layers, activation = tuple(self.config.hidden_layers), self.config.activation
-        return _Network(hidden_layers, outputs, activation)
+    def weights(self) -> DistanceWeights:
+        """The metric's weights, where the learner may be any arm."""
+        return check_metric(self.env.metric)
 
     @functools.cached_property
-    def built_metric(self) -> Metric:
-        """The metric between the two arms."""
+    def _own_pair(self) -> Pair:
+        assert self.learner is not None
         # A cached value must not be a tracer of the first function that is traced with it. On the host because the
         # first computation on a GPU takes seconds to start.
         with jax.ensure_compile_time_eval(), on_host():
-            metric = self.metric.build(self.expert, self.learner)
-            matrix = metric.correspondence
-            return metric if callable(matrix) else dataclasses.replace(metric, correspondence=np.asarray(matrix))
+            metric = self.env.metric.build(self.expert.embodiment, self.learner.embodiment)
+            if not callable(metric.correspondence):
+                metric = dataclasses.replace(metric, correspondence=np.asarray(metric.correspondence))
+            return Pair(self.expert.data, self.learner.data, metric)
 
-    @property
-    def distance(self) -> PoseDistance:
-        """Embodiment distance between a pose of the expert and a pose of the learner."""
-        metric = self.built_metric
-        return lambda qpos, learner_qpos: metric(
-            link_states(self.expert, qpos), link_states(self.learner, learner_qpos)
-        )
+    def pair(self, learner: Arm | None = None, expert: Arm | None = None) -> Pair:
+        """The arms of a mapping: the model's own ones, or any learner and, where the model takes any, any expert."""
+        if self.learner is not None:
+            return self._own_pair
+        # XLA computes with a constant what it can while it compiles, which rounds otherwise than an argument does.
+        expert = expert if self.takes_any_expert and expert is not None else self.expert.data
+        assert isinstance(expert, ArmArrays) and isinstance(learner, ArmArrays)
+        return Pair.of_arrays(expert, learner, self.weights)
+
+    @functools.cached_property
+    def _network(self) -> nn.Module:
+        config = self.config
+        if self.learner is not None:
+            return FullyConnected(config.heads, tuple(config.hidden_layers), config.activation, config.inputs)
+        links = MAX_LINKS if self.takes_any_expert else self.expert.embodiment.num_links
+        return JointTokens(config.heads, config.width, config.layers, links)
 
     def init(self, key: Array) -> Params:
         """Random parameters."""
-        return self._network.init(key, self._inputs(jnp.zeros(self.expert.num_joints)))
+        target = self.pair(self.expert.data).target(jnp.zeros(len(self.expert.data.joint_range)))
+        return self._network.init(key, target)
 
-    def candidates(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, "heads learner_joints"]:
-        """The poses that the heads propose.
+    def candidates(self, params: Params, target: Target) -> Poses:
+        """The poses that the heads propose [rad]; locked joints stay at home.
 
         Args:
           params: parameters of the network.
-          qpos: the expert's pose [rad].
+          target: the arms, with the expert in its pose.
         """
-        config = self.config
-        outputs = self._network.apply(params, self._inputs(qpos))
-        outputs = jnp.reshape(outputs, (config.heads, self.learner.num_joints, 2))  # type: ignore[arg-type] - flax annotates all that apply may return
-        lower, upper = (jnp.asarray(bound, qpos.dtype) for bound in np.asarray(self.learner.joint_range).T)
-        within = (lower + upper) / 2 + (upper - lower) / 2 * jnp.tanh(outputs[..., 0])
-        if config.outputs == "tanh":
-            return within
-        on_circle = jnp.arctan2(outputs[..., 1], outputs[..., 0])  # continuous in the outputs at pi
-        return jnp.where(continuous_joints(self.learner), on_circle, within)
+        outputs: Any = self._network.apply(params, target)
+        return poses_within_range(target.pair.learner, outputs, on_circle=self.config.outputs != "tanh")
 
-    def __call__(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, " learner_joints"]:
-        """The nearest of the poses that the heads propose."""
-        candidates = self.candidates(params, qpos)
-        if self.config.heads == 1:
-            return candidates[0]
-        distances = jax.vmap(lambda candidate: self.distance(qpos, candidate))(candidates)
-        return candidates[jnp.argmin(distances)]
+    def initial_poses(self, params: Params, target: Target) -> Poses:
+        """The poses of the heads, then `guesses` that do not depend on the expert [rad]."""
+        proposed, learner = self.candidates(params, target), target.pair.learner
+        if not self.config.guesses:
+            return proposed
+        assert isinstance(learner, ArmArrays)
+        lower, upper = learner.joint_range[:, 0], learner.joint_range[:, 1]
+        guesses = lower + _spread(self.config.guesses) * (upper - lower)
+        return jnp.concatenate([proposed, jnp.where(learner.is_free > 0, guesses, learner.home)])
 
-    def _inputs(self, qpos: Array) -> Array:
-        if self.config.inputs == "link_states":
-            states = link_states(self.expert, qpos)
-            assert states.direction is not None
-            return jnp.concatenate([states.position.ravel(), states.direction.ravel()])
-        lower, upper = (jnp.asarray(bound, qpos.dtype) for bound in np.asarray(self.expert.joint_range).T)
-        qpos = wrap_angles(qpos, continuous_joints(self.expert))
-        return (2 * qpos - lower - upper) / (upper - lower)
+    def improved(self, params: Params, target: Target) -> Poses:
+        """The initial poses after the Newton steps [rad]."""
+        poses = self.initial_poses(params, target)
+        return target.improved(poses, self.config.refinements) if self.config.refinements else poses
 
+    def __call__(self, params: Params, target: Target) -> Float[Array, " learner_joints"]:
+        """The nearest of the poses after the Newton steps [rad]."""
+        poses = self.improved(params, target)
+        return poses[0] if len(poses) == 1 else target.nearest(poses)[1]
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class PoseMapper:
-    """A trained mapper: call it with one pose of the expert or a batch of poses. Safe under `jax.jit` and `jax.vmap`.
+    @functools.cached_property
+    def of_poses(self) -> Callable[..., Float[Array, "poses learner_joints"]]:
+        """(parameters, poses of the expert, learner, expert) -> poses [rad], compiled once whatever the arms are.
 
-    Attributes:
-      model: network, arms and metric.
-      params: parameters of the network.
-    """
-
-    model: MapperModel | OnePairModel
-    params: Params
-
-    @classmethod
-    def load(cls, run_dir: str | os.PathLike[str], checkpoint: int | None = None) -> "PoseMapper":
-        """Loads the mapper of a run of `python -m mimic.train trainer=pose_mapper`.
-
-        Args:
-          run_dir: the run directory.
-          checkpoint: number of training poses of the checkpoint; the last checkpoint where None.
-
-        Raises:
-          ValueError: no run directory, a run of another trainer or of any arm, or no such checkpoint.
+        The arms are arrays, or None where the mapper has its own ones.
         """
-        config = load_config(Path(run_dir))
-        if not isinstance(config.trainer, PoseMapperConfig):
-            raise ValueError(
-                f"{os.fspath(run_dir)!r}: expected a run of trainer=pose_mapper, got one of {config.trainer.name}"
-            )
-        if config.env.kind == "sampled_arms":
-            raise ValueError(
-                f"{os.fspath(run_dir)!r}: expected a run with one learner, got env={config.env.name}; load it with "
-                "mimic.AnyArmMapper.load(RUN_DIR).to(LEARNER)"
-            )
-        model = make_model(config.env, config.trainer)
-        template = jax.eval_shape(model.init, jax.random.key(0))
-        return cls(model, load_checkpoint(Path(run_dir), template, checkpoint)[1])
 
-    @property
-    def expert(self) -> Embodiment:
-        """The arm of the input poses."""
-        return self.model.expert
+        def of_pose(params: Params, qpos: Array, learner: Any, expert: Any) -> Array:
+            return self(params, self.pair(learner, expert).target(qpos))
 
-    @property
-    def learner(self) -> Embodiment:
-        """The arm of the output poses."""
-        return self.model.learner
-
-    def __call__(self, qpos: Float[ArrayLike, "*batch joints"]) -> Float[Array, "*batch learner_joints"]:
-        """Maps poses of the expert to poses of the learner [rad].
-
-        Args:
-          qpos: [n] or [..., n] the expert's poses [rad].
-
-        Returns:
-          [n_hat] or [..., n_hat] the learner's poses [rad].
-
-        Raises:
-          ValueError: poses of the wrong shape, not finite, or outside of the expert's joint range.
-        """
-        poses = check_poses(self.expert, qpos)
-        flat = poses.reshape(-1, self.expert.num_joints)
-        learner_poses = jax.vmap(functools.partial(self.model, self.params))(flat)
-        return learner_poses.reshape(*poses.shape[:-1], self.learner.num_joints)
-
-    def check_fits(self, expert: Embodiment, learner: Embodiment) -> None:
-        """Raises a ValueError unless the mapper maps poses of this expert to poses of this learner."""
-        for role, arm, own in (("expert", expert, self.expert), ("learner", learner, self.learner)):
-            if (arm.name, arm.joint_names) != (own.name, own.joint_names):
-                raise ValueError(
-                    f"mapper: its {role} is {own.name} with joints {', '.join(own.joint_names)}, "
-                    f"expected {arm.name} with joints {', '.join(arm.joint_names)}"
-                )
+        return jax.jit(jax.vmap(of_pose, (None, 0, None, None)))
 
 
 def make_model(env: EnvConfig, config: PoseMapperConfig) -> MapperModel:
     """The untrained mapper of an environment's arms and metric.
 
     Raises:
-      ValueError: arms that cannot be loaded.
+      ValueError: arms that cannot be loaded; where the learner is drawn, an expert that has no arrays, or a metric
+        other than of constant weights.
     """
-    return MapperModel(*env.build_arms().embodiments, env.metric, config)
+    if env.kind != "sampled_arms":
+        return MapperModel(env, config, *(MapperArm.constant(arm) for arm in env.build_arms().embodiments))
+    model = MapperModel(env, config, MapperArm.without_locks(build_arm(env.expert, env.limits, env.metric.links)), None)
+    _ = model.weights
+    return model
 
 
-def check_poses(arm: Embodiment, qpos: ArrayLike) -> Array:
-    """Returns poses as a floating point array. Under `jax.jit` only the shape is checked.
-
-    Raises:
-      ValueError: poses of the wrong shape, not finite, or outside of the arm's joint range.
-    """
-    poses = checked_poses(arm, jnp.asarray(qpos))
-    if isinstance(poses, Tracer):
-        return poses
-    values = np.asarray(poses)
-    lower, upper = pose_limits(arm, values.dtype)
-    outside = (values < lower - _LIMIT_TOLERANCE) | (values > upper + _LIMIT_TOLERANCE)
-    if outside.any():
-        *_, joint = first = tuple(np.argwhere(outside)[0])
-        raise ValueError(
-            f"qpos: {arm.joint_names[joint]} at {values[first]:.4f} rad is outside of its range "
-            f"[{lower[joint]:.4f}, {upper[joint]:.4f}]"
-        )
-    return poses
+def _spread(count: int) -> Float[np.ndarray, "count joints"]:
+    """Points that fill the unit cube evenly: the additive recurrence of M. Roberts (2018), which never changes."""
+    root = 2.0
+    for _ in range(64):
+        root = (1 + root) ** (1 / (MAX_JOINTS + 1))  # solves x^(joints + 1) = x + 1
+    steps = root ** -np.arange(1.0, MAX_JOINTS + 1)
+    return ((0.5 + np.outer(np.arange(1, count + 1), steps)) % 1).astype(np.float32)

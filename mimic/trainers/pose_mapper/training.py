@@ -1,7 +1,6 @@
 """Training of a pose mapper: the embodiment distance is the loss, and there are no labels (paper, eq. 23)."""
 
 import dataclasses
-import functools
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -14,12 +13,14 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from mimic.arms.sampler import Sampler
 from mimic.base.compilation import Background, compiling
 from mimic.runs.checkpoints import STATE_UNUSED, Checkpoint, checkpoint_steps, save_checkpoint, thin_checkpoints
 from mimic.runs.divergence import check_finite
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig
 from mimic.trainers.pose_mapper.model import MapperModel, Params
+from mimic.trainers.pose_mapper.pair import Target, random_poses
 from mimic.trainers.schedules import schedules_from
 from mimic.trainers.trainer import OnEvaluation
 
@@ -27,7 +28,6 @@ _WARM_UP = 0.02  # fraction of the updates over which the learning rate rises
 # Fraction of the loss that is the mean over all heads, so that each head is trained; the rest is the nearest head's.
 _ALL_HEADS = 0.1
 
-Poses = Float[Array, "poses joints"]
 Samples = Any  # a pytree of arrays [samples, ...]: what a loss is computed of
 
 
@@ -238,27 +238,27 @@ def _keys(seed: Any) -> Array:
     return jax.random.split(jax.random.key(seed), 3)
 
 
-def mapper_objective(model: MapperModel) -> Objective:
-    """The mean distance of a mapper to one learner, over poses of the expert."""
-    return Objective(model.init, functools.partial(random_poses, model), functools.partial(_distances, model))
+def mapper_objective(model: MapperModel, sampler: Sampler | None = None) -> Objective:
+    """The mean distance of the poses that a mapper proposes, before the Newton steps.
 
+    A sample is a pose of the expert. Where a sampler draws the learners, and the experts that the mapper takes, it is a
+    random key: arms and pose are drawn within the loss, so that an epoch needs no memory for its arms.
+    """
 
-def random_poses(model: MapperModel, key: Array, count: int) -> Poses:
-    """Poses of the expert, uniform within its joint range."""
-    lower, upper = jnp.asarray(model.expert.joint_range, jnp.float32).T
-    return jax.random.uniform(key, (count, model.expert.num_joints), jnp.float32, minval=lower, maxval=upper)
+    def target_of_key(key: Array) -> Target:
+        assert sampler is not None
+        key_learner, key_pose, key_expert = jax.random.split(key, 3)
+        pair = model.pair(sampler(key_learner), sampler(key_expert) if model.takes_any_expert else None)
+        return pair.target(random_poses(pair.expert, key_pose))
 
+    def distances(params: Params, samples: Samples) -> Float[Array, "samples heads"]:
+        def of_sample(sample: Array) -> Float[Array, " heads"]:
+            target = model.pair().target(sample) if sampler is None else target_of_key(sample)
+            return target.distances(model.candidates(params, target))
 
-def poses_shape(model: MapperModel, count: int) -> jax.ShapeDtypeStruct:
-    """The shape of an array of poses of the expert."""
-    return jax.ShapeDtypeStruct((count, model.expert.num_joints), jnp.float32)
+        return jax.vmap(of_sample)(samples)
 
+    def poses(key: Array, count: int) -> Samples:
+        return random_poses(model.expert.data, key, (count,))
 
-def _distances(model: MapperModel, params: Params, poses: Poses) -> Float[Array, "poses heads"]:
-    """Distances of the poses that the heads propose."""
-
-    def head_distances(qpos: Array) -> Array:
-        candidates = model.candidates(params, qpos)
-        return jax.vmap(lambda candidate: model.distance(qpos, candidate))(candidates)
-
-    return jax.vmap(head_distances)(poses)
+    return Objective(model.init, poses if sampler is None else jax.random.split, distances)

@@ -7,7 +7,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
-import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
@@ -16,12 +15,12 @@ from mimic.arms.embodiment import Embodiment
 from mimic.base import compat
 from mimic.base.config import check_choice
 from mimic.envs import env_config
-from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.pretrained.files import SOURCE, read_config_and_report, read_params
 
 if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv
-    from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
+    from mimic.trainers.pose_mapper.mapper import PoseMapper
 
 NETWORKS = Path(__file__).parent / "networks"
 TRAINERS = {"policy": "ppo", "pose_mapper": "pose_mapper"}  # of each kind of network
@@ -96,14 +95,14 @@ class Pretrained:
 
 
 @overload
-def load(name: Literal["any_arm"], kind: Literal["pose_mapper"]) -> "AnyArmMapper": ...
+def load(name: Literal["any_arm"], kind: Literal["pose_mapper"]) -> "PoseMapper": ...
 
 
 @overload
 def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> Pretrained: ...
 
 
-def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> "Pretrained | AnyArmMapper":
+def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> "Pretrained | PoseMapper":
     """Loads a trained network that comes with mimic. Nothing is downloaded.
 
     Args:
@@ -111,7 +110,7 @@ def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> "Pretr
       kind: "policy", or "pose_mapper".
 
     Returns:
-      The network; of `load("any_arm", "pose_mapper")` an `AnyArmMapper`, which takes the learner as a second argument.
+      The network; of `load("any_arm", "pose_mapper")` a `PoseMapper`, which takes the learner as a second argument.
 
     Raises:
       ValueError: there is no such network.
@@ -119,7 +118,8 @@ def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> "Pretr
     check_choice("kind", kind, tuple(TRAINERS))
     check_choice("name", name, pretrained_names(kind))
     folder = NETWORKS / f"{name}-{kind}"
-    return read_any_arm_mapper(folder) if env_config(name).kind == "sampled_arms" else read_network(folder, kind)
+    network = read_network(folder, kind)
+    return network.function if env_config(name).kind == "sampled_arms" else network  # type: ignore[return-value]
 
 
 def pretrained_names(kind: str) -> tuple[str, ...]:
@@ -133,7 +133,7 @@ def names_of_one_learner(kind: str) -> tuple[str, ...]:
 
 
 def read_network(folder: Path, kind: str) -> Pretrained:
-    """The network of one learner in a folder that `write_network` wrote.
+    """The network in a folder that `write_network` wrote.
 
     Raises:
       ValueError: a file is missing, damaged, or of another kind of network.
@@ -141,20 +141,8 @@ def read_network(folder: Path, kind: str) -> Pretrained:
     config, report = read_config_and_report(folder)
     if config.trainer.name != TRAINERS[kind]:
         raise ValueError(f"{str(folder)!r}: expected a network of trainer={TRAINERS[kind]}, got {config.trainer.name}")
-    function = {"policy": _policy, "pose_mapper": _mapper}[kind](folder, config)
+    function = _policy(folder, config) if kind == "policy" else _mapper(folder, config, report)
     return Pretrained(config.env.name, kind, config, report, function)
-
-
-def read_any_arm_mapper(folder: Path) -> "AnyArmMapper":
-    """The mapper to any arm in a folder that `write_network` wrote.
-
-    Raises:
-      ValueError: a file is missing or damaged.
-    """
-    from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper  # imports flax networks
-
-    config, report = read_config_and_report(folder)
-    return AnyArmMapper.read(config, lambda template: read_params(folder, template), report)
 
 
 def policy_template(config: TrainConfig) -> tuple[Any, Any]:
@@ -192,9 +180,7 @@ def _policy(folder: Path, config: TrainConfig) -> Function:
     return policy
 
 
-def _mapper(folder: Path, config: TrainConfig) -> Function:
-    from mimic.trainers.pose_mapper.model import PoseMapper, make_model  # imports flax networks
+def _mapper(folder: Path, config: TrainConfig, report: dict[str, Any]) -> Function:
+    from mimic.trainers.pose_mapper.mapper import PoseMapper  # imports flax networks
 
-    model = make_model(config.env, cast(PoseMapperConfig, config.trainer))
-    template = jax.eval_shape(model.init, jax.random.key(0))
-    return PoseMapper(model, read_params(folder, template))
+    return PoseMapper.read(config, lambda template: read_params(folder, template), report)

@@ -19,9 +19,9 @@ from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.export.config import ExportConfig
 from mimic.trainers.export.export import exported_function
 from mimic.trainers.export.export_controller import prepare_controller
-from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
-from mimic.trainers.pose_mapper.any_arm_model import make_any_arm_model
-from mimic.trainers.pose_mapper.model import PoseMapper, make_model
+from mimic.trainers.pose_mapper.mapper import PoseMapper
+from mimic.trainers.pose_mapper.mapper_arm import describe_arm
+from mimic.trainers.pose_mapper.model import make_model
 from mimic.trainers.ppo.ppo import initial_params, make_controller, make_networks
 from mimic.trainers.run_config import save_config
 from tests.helpers.tiny import SHORT_ARMS
@@ -139,11 +139,11 @@ def any_arm_run(run_dir, expert="fixed"):
     """A run whose mapper to any arm has random weights."""
     env = mimic.env_config("any_arm", arms={"expert": expert})
     config = PoseMapperConfig(preset="any_arm", width=16, layers=1, heads=2, guesses=1, refinements=2).resolve()
-    params = jax.jit(make_any_arm_model(env, config).init)(jax.random.key(3))
+    params = jax.jit(make_model(env, config).init)(jax.random.key(3))
     run_dir.mkdir()
     save_config(run_dir, TrainConfig(env, config))
     save_checkpoint(run_dir, 5, params)
-    return AnyArmMapper.load(run_dir)
+    return PoseMapper.load(run_dir)
 
 
 @pytest.mark.slow
@@ -170,7 +170,7 @@ def test_an_onnx_mapper_to_any_arm_equals_the_mapper(tmp_path, expert):
         assert np.mean(off < 1e-3) >= 0.95, name  # Newton steps magnify rounding errors
         assert np.sum(np.ptp(expected, axis=0) > 0.1) == np.sum(np.ptp(outputs, axis=0) > 1e-6) == joints
         if name != "random":
-            joints_of_arm = mapper.describe(name).joints
+            joints_of_arm = describe_arm(mapper.env, name).joints
             np.testing.assert_allclose(expected[:, joints_of_arm], mapper(poses, name), atol=1e-3)
     metadata = session.get_modelmeta().custom_metadata_map
     layout = json.loads(metadata["learner_layout"])

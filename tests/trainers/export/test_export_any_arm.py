@@ -17,7 +17,7 @@ from mimic.envs.many_arms import any_arm_state
 from mimic.retargeting.array_goals import random_numbers
 from mimic.runs.checkpoints import load_checkpoint, save_checkpoint
 from mimic.trainers.make import make_any_arm_trainer
-from mimic.trainers.pose_mapper.any_arm_mapper import describe_arm
+from mimic.trainers.pose_mapper.mapper_arm import describe_arm
 from mimic.trainers.run_config import load_config
 from tests.helpers.random_arms import random_arm as random_model
 from tests.helpers.untrained_family import HORIZON, untrained_family
@@ -52,7 +52,7 @@ def test_a_description_has_the_dynamics_and_the_maximum_torque(run_dir, tmp_path
     assert part(vector, "is_free").tolist() == [1, 0, 1, 0, 1, 1, 1, 0]
     torque = part(vector, "torque_limit")
     assert np.all((torque > 0) == (part(vector, "is_free") > 0))
-    panda = describe_arm(env, "panda").arrays
+    panda = describe_arm(env, "panda").data
     np.testing.assert_allclose(part(vector, "second_moment"), panda.second_moment, rtol=1e-6)
     np.testing.assert_array_equal(vector[: description_size()], description(with_locks(panda, [1, 3])))
     whole = described(run_dir, tmp_path / "whole.json", learner="panda")
@@ -101,7 +101,7 @@ def test_an_onnx_policy_of_any_arm_equals_the_environment(run_dir, tmp_path):
     save_checkpoint(run_dir, 1, (statistics, *networks))
     session = onnxruntime.InferenceSession(str(mimic.export_run(run_dir, tmp_path / "policy.onnx")))
     env, policy = trainer.evaluator.env, trainer.policy((statistics, *networks))
-    panda = jax.tree.map(jnp.asarray, describe_arm(trained.env, "panda").arrays)
+    panda = jax.tree.map(jnp.asarray, describe_arm(trained.env, "panda").data)
     locked = dataclasses.replace(panda, is_free=panda.is_free.at[jnp.array([1, 4])].set(0))
     arms = jax.tree.map(lambda *x: jnp.stack(x), panda, locked, random_arm(jax.random.PRNGKey(1)))
     key, motions = jax.random.PRNGKey(0), env.demonstrations
