@@ -84,7 +84,7 @@ def _features(target: Target, expert_links: int) -> list[tuple[str, Array, Array
     """
     expert, learner = target.pair.expert, target.pair.learner
     assert isinstance(expert, ArmArrays) and isinstance(learner, ArmArrays)
-    frames = frame_table(learner, learner.home)
+    frames = frame_table(learner, jnp.asarray(learner.home))
     states, (axes, origins) = states_in_frames(learner, frames), axes_and_origins(frames)
     unit = 1 / learner.chain_length
     own, has_link = learner.is_free[:, None], (learner.link_length > 0).astype(unit.dtype)
