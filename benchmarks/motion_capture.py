@@ -34,9 +34,9 @@ from mimic.commands.config import CaptureConfig
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.metric.similarity import centre_line_table, similarity
-from mimic.motions.mocap.arms import SIDES
 from mimic.motions.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
 from mimic.motions.mocap.link_motion import TRUNK, LinkMotion
+from mimic.motions.mocap.points import SIDES
 from mimic.retargeting.pose_baselines import hand_ik, hold_home
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig

@@ -13,7 +13,9 @@ UPS = ("x", "y", "z", "-x", "-y", "-z")
 # Shoulder to wrist of adults. Of two units, only dm and cmu have numbers in common there: 7.1 to 7.5.
 _ARM_LENGTH = 0.4, 0.75  # m
 STATED_ARM_LENGTH = 0.3, 0.9  # m, also of children: where a file states the unit
-_WEIGHTS = {"usual": 1.5, "stated": 3.0, "body": 2.0, "floor": 2.0, "rest": 1.0}  # of what speaks for an axis as up
+# Of what speaks for an axis as up.
+_WEIGHTS = {"usual": 1.5, "stated": 3.0, "body": 2.0, "unlikely": 1.0, "floor": 2.0, "rest": 1.0}
+_LIKELY = ("y", "z", "-y")  # axes that point up; -y in the frame of a camera
 _HIGH = {"head": ("head",), "neck": ("neck",), "shoulders": ("shoulder",), "arms": ("upper_arm",)}
 _LOW = {"feet": ("foot",), "toes": ("toe",), "hips": ("hip",), "knees": ("knee",)}
 _FLOOR = -0.04, 0.1, 0.04  # of the body's size: height of its lowest point at least and at most, and mean height
@@ -53,7 +55,8 @@ def find_up(motion: PointMotion, usual: str, stated: str = "", rest: np.ndarray 
     """The axis that points up, and how it was found.
 
     What speaks for an axis is weighed: the body stands along it, its lowest points are at 0, the skeleton at rest
-    stands along it, the file states it, and it is usual. A person may lie or stand on the hands.
+    stands along it, the file states it, and it is usual. A person may lie or stand on the hands: a body along an axis
+    that is hardly ever up counts less.
 
     Args:
       motion: the points, in the file's axes.
@@ -64,7 +67,8 @@ def find_up(motion: PointMotion, usual: str, stated: str = "", rest: np.ndarray 
     votes = dict.fromkeys(UPS, 0.0)
     votes[usual] += _WEIGHTS["usual"]
     body, how = _body_axis(motion)
-    evidence = {"stated": stated, "body": body, "floor": _floor_axis(motion) if "feet" in how else ""}
+    evidence = {"stated": stated, "floor": _floor_axis(motion, (body, stated, usual)) if "feet" in how else ""}
+    evidence["body" if body in _LIKELY and body != f"-{usual}" else "unlikely"] = body
     if rest is not None:
         evidence["rest"] = _body_axis(dataclasses.replace(motion, positions=rest[None]))[0]
     for kind, axis in evidence.items():
@@ -73,7 +77,7 @@ def find_up(motion: PointMotion, usual: str, stated: str = "", rest: np.ndarray 
     up = max(votes, key=votes.__getitem__)
     if up == body:
         return up, how if not stated or stated == up else f"{how}, though the file states {stated}"
-    reason = "as the file states" if up == stated else "as usual for such files"
+    reason = {stated: "as the file states", usual: "as usual for such files"}.get(up, "from the floor")
     if body:
         return up, f"{reason}, though the body is along {body}: a guess, capture.up= sets it"
     return up, reason if up == stated else f"{reason}: a guess without head and feet, capture.up= sets it"
@@ -114,9 +118,9 @@ def _mean_of(motion: PointMotion, parts: tuple[str, ...]) -> np.ndarray | None:
     return motion.positions[:, indices].mean(axis=1) if indices else None
 
 
-def _floor_axis(motion: PointMotion) -> str:
-    """The axis along which the whole body is just above 0; "" where there is none, or several."""
-    indices = [i for i, part in enumerate(parts_of(motion.names)) if part and part.side]
+def _floor_axis(motion: PointMotion, likely: tuple[str, ...]) -> str:
+    """The axis along which the whole body is just above 0; of several a likely one, or "", as where there is none."""
+    indices = [i for i, part in enumerate(parts_of(motion.names)) if part]
     points = motion.positions[:, indices]
     points = points[np.isfinite(points).all(axis=2).sum(axis=1) > 0.5 * len(indices)] if indices else points[:0]
     if not len(points):
@@ -129,7 +133,8 @@ def _floor_axis(motion: PointMotion) -> str:
         lowest, middle = np.median(np.nanmin(height, axis=1)), np.median(np.nanmean(height, axis=1))
         if minimum <= lowest <= maximum and middle >= mean:
             found.append(up)
-    return found[0] if len(found) == 1 else ""
+    chosen = [axis for axis in likely if axis in found] or (found if len(found) == 1 else [])
+    return chosen[0] if chosen else ""
 
 
 def z_up(positions: np.ndarray, up: str) -> np.ndarray:

@@ -181,6 +181,7 @@ def one_person(motion: PointMotion, subject: str) -> PointMotion:
       ValueError: there is no such person.
     """
     found = persons(motion)
+    subject = next((name for name in found if name.lower() == subject.lower()), subject)
     if subject and subject not in found:
         raise ValueError(f"subject: expected one of {', '.join(map(repr, found)) or 'none'}, got {subject!r}")
     if len(found) < 2:

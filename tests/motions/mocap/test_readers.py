@@ -335,7 +335,7 @@ def test_one_of_several_persons_is_read(tmp_path, expected):
     motion = read_motion(path)
     assert "persons: ann, bob, of which ann is read (capture.subject=)" in motion.notes
     assert motion.names[0] == "Ann_LSHO"
-    np.testing.assert_allclose(read_motion(path, subject="bob").point("Bob_LSHO"), positions[:, 9], atol=1e-6)
+    np.testing.assert_allclose(read_motion(path, subject="Bob").point("Bob_LSHO"), positions[:, 9], atol=1e-6)
     with pytest.raises(ValueError, match="subject: expected one of 'ann', 'bob', got 'Eve'"):
         read_motion(path, subject="Eve")
 
