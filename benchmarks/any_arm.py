@@ -30,7 +30,7 @@ from mimic.envs.imitation import training_and_held_out
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.evaluation.rollout_metrics import MIN_SPAN
 from mimic.metric.kinematics import link_states
-from mimic.metric.similarity import motion_similarity
+from mimic.metric.similarity import centre_line, similarity
 from mimic.retargeting.array_bound import closest_motion
 
 REAL = ("ur5e", "ur10e", "iiwa", "iiwa14", "kinova3", "gen3", "sawyer", "jaco", "xarm7", "fetch")
@@ -77,7 +77,8 @@ def run_arm(env: AnyArmEnv, expert: ArmArrays, arm: ArmArrays) -> dict[str, jax.
         closest = closest_motion(arm, metric, states, qpos)
         home = jnp.broadcast_to(arm.home, qpos.shape)
         poses = {"": qpos, "best_": closest.qpos, "hold_": home}
-        measures = {prefix: motion_similarity(expert, arm, expert_qpos, motion) for prefix, motion in poses.items()}
+        line = centre_line(expert, expert_qpos)
+        measures = {prefix: similarity(line, centre_line(arm, motion)) for prefix, motion in poses.items()}
         return {
             "distance": distance,
             # A controller below the bound has found a minimum that the search missed.

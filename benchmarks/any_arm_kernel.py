@@ -28,7 +28,7 @@ from mimic.arms.sampler import random_arm
 from mimic.control.joint_control import JointParameters, Reference, Target, action_target
 from mimic.envs import env_config
 from mimic.envs.world_env import plant_of
-from mimic.physics import composite_kernel, inner_loop, physics
+from mimic.physics import composite_kernel, inner_loop
 from mimic.physics.joint_numbers import joint_numbers
 from mimic.physics.plant import draw_episode
 from mimic.physics.world import WorldConfig
@@ -66,7 +66,7 @@ def of_physics(substeps: int) -> Case:
     inputs = [jax.vmap(joint_numbers)(arms), qpos, qvel * np.asarray(arms.is_free), torque, load]
     return Case(
         composite_kernel.gpu_kernel(TIMESTEP, substeps),
-        physics.array_step(TIMESTEP, substeps),
+        composite_kernel.array_step(TIMESTEP, substeps),
         [np.asarray(x, np.float32) for x in inputs],
         lambda outputs: outputs[1],
         substeps,

@@ -31,7 +31,7 @@ from mimic.metric.correspondence import arc_length_correspondence
 from mimic.metric.distance import Metric
 from mimic.metric.kinematics import LinkStates, link_states
 from mimic.motions.demonstrations import Demonstrations
-from mimic.physics.physics import make_advance
+from mimic.physics.composite_kernel import make_advance
 from mimic.physics.step import Load, PhysicsChoice
 from mimic.retargeting.array_goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
 

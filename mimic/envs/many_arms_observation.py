@@ -10,7 +10,6 @@ from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
 from mimic.envs.many_arms_control import Plan
 from mimic.metric.kinematics import LinkStates, axes_and_origins, frame_table, states_in_frames
 from mimic.retargeting.array_goals import Goals
-from mimic.retargeting.array_nearest import angle_limits
 
 JOINT_FEATURES = 18  # numbers of each joint; the first says whether it is free
 _LINK_FEATURES, _EXPERT_FEATURES = 7, 12
@@ -56,7 +55,7 @@ def observe(
     dt, limit, unit = control_dt, arm.velocity_limit, 1 / arm.chain_length
     own, step = arm.is_free, control_dt * limit
     inertia = jnp.diagonal(plan.inertia)
-    lower, upper = angle_limits(arm)
+    lower, upper = arm.angle_limits
     numbers = [
         own,
         (goals.goal.qpos - qpos) / step,

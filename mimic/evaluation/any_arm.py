@@ -20,7 +20,7 @@ from mimic.envs.many_arms import AnyArmEnv, any_arm_state
 from mimic.evaluation.evaluator import Controller
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.metric.kinematics import LinkStates, link_states
-from mimic.metric.similarity import motion_similarity
+from mimic.metric.similarity import centre_line, similarity
 from mimic.retargeting.array_bound import closest_motion
 from mimic.runs.files import write_csv
 
@@ -216,7 +216,7 @@ class ArmsEvaluator:
         """Measures of similarity [arms, demonstrations] of motions of all arms, means over time."""
 
         def of_one(arm: ArmArrays, expert_qpos: Array, qpos: Array) -> dict[str, Array]:
-            values = motion_similarity(self._expert, arm, expert_qpos, qpos)
+            values = similarity(centre_line(self._expert, expert_qpos), centre_line(arm, qpos))
             return {name: value.mean() for name, value in values.items()}
 
         of_arm = jax.vmap(of_one, in_axes=(None, 0, 0))

@@ -240,23 +240,6 @@ def similarity(expert: CentreLine, learner: CentreLine) -> dict[str, Float[Any, 
     return dict(zip(MEASURES, values, strict=True))
 
 
-def motion_similarity(
-    expert: ArmArrays,
-    learner: ArmArrays,
-    expert_qpos: Float[Array, "time joints"],
-    learner_qpos: Float[Array, "time joints"],
-) -> dict[str, Float[Array, " time"]]:
-    """The measures of `similarity` of two arms as data at each time; batch with `jax.vmap`.
-
-    Args:
-      expert: the arm that is imitated.
-      learner: the arm that imitates.
-      expert_qpos: the expert's angles, those of its locked joints included [rad].
-      learner_qpos: the learner's angles at the same times [rad].
-    """
-    return similarity(centre_line(expert, expert_qpos), centre_line(learner, learner_qpos))
-
-
 def _matched(expert: CentreLine, learner: CentreLine) -> tuple[CentreLine, CentreLine]:
     """Both lines with an axis of their corresponding chains."""
     lines = [line if line.chains else _with_chain(line) for line in (expert, learner)]

@@ -103,14 +103,6 @@ def inverse(
     return torque
 
 
-def torque_of_arm(
-    arm: ArmArrays, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"], qacc: Float[Array, " joints"]
-) -> Float[Array, " joints"]:
-    """Inverse dynamics of an arm as data: `inverse`, with 0 for locked joints."""
-    joints = unpacked(joint_numbers(arm))
-    return arm.is_free * jnp.stack(inverse(joints, list(qpos), list(qvel), list(arm.is_free * qacc)))
-
-
 def inertia_matrix(arm: ArmArrays, qpos: Float[Array, " joints"]) -> Float[Array, "joints joints"]:
     """Joint-space inertia with the armature [kg m^2]; locked joints have the rows of the identity."""
     return inertia_and_bias(arm, qpos, jnp.zeros_like(qpos))[0]

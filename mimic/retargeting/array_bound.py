@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates, link_states
-from mimic.retargeting.array_nearest import angle_limits, solve_free
+from mimic.retargeting.array_nearest import solve_free
 from mimic.retargeting.kinematic_bound import MIN_SPEED, ClosestMotion, SearchSpace, search_motion
 
 _PARTS = ("linear_velocity", "angular_velocity")
@@ -114,6 +114,6 @@ def _search_space(arm: ArmArrays) -> SearchSpace:
         return link_states(arm, pinned(qpos), jnp.where(free, qvel, 0.0))
 
     unlimited = jnp.where(free, jnp.full_like(arm.home, jnp.inf), 0.0)
-    lower, upper = angle_limits(arm)
-    limits = jnp.concatenate([pinned(lower), -unlimited]), jnp.concatenate([pinned(upper), unlimited])
+    lower, upper = arm.angle_limits
+    limits = jnp.concatenate([lower, -unlimited]), jnp.concatenate([upper, unlimited])
     return SearchSpace(states, (pinned(arm.joint_range[:, 0]), pinned(arm.joint_range[:, 1])), limits)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates, link_states
-from mimic.retargeting.array_nearest import NearestPose, angle_limits, nearest_pose
+from mimic.retargeting.array_nearest import NearestPose, nearest_pose
 
 NEWTON_STEPS = 3  # of each pose; 1 gives a gap of 0.16 instead of 0.14 % on panda4dof, 8 gives 0.13 %
 OTHERS = 4  # minima that are followed beside the goal
@@ -138,7 +138,7 @@ def _without_revolutions(
 ) -> Float[Array, "poses joints"]:
     """The same poses at the shortest way from a pose, where a joint can rotate by full revolutions."""
     revolutions = 2 * jnp.pi * jnp.round((poses - qpos) / (2 * jnp.pi))
-    return jnp.where(jnp.isinf(angle_limits(arm)[0]), poses - revolutions, poses)
+    return jnp.where(jnp.isinf(arm.angle_limits[0]), poses - revolutions, poses)
 
 
 def _estimates(

@@ -115,13 +115,6 @@ def pose_quadratic(
     return PoseQuadratic(gradient, hessian, rate)
 
 
-def angle_limits(arm: ArmArrays) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
-    """Minimum and maximum angles [rad]; infinite for joints that can rotate by a full revolution."""
-    lower, upper = arm.joint_range[:, 0], arm.joint_range[:, 1]
-    is_continuous = upper - lower >= 2 * jnp.pi - 1e-4  # models round pi in their text
-    return jnp.where(is_continuous, -jnp.inf, lower), jnp.where(is_continuous, jnp.inf, upper)
-
-
 def solve_free(
     matrix: Float[Array, "joints joints"], vector: Float[Array, " joints"], is_free: Float[Array, " joints"]
 ) -> Float[Array, " joints"]:
@@ -150,7 +143,7 @@ def nearest_pose(
       steps: Newton steps.
       max_step: largest change of a joint in a step [rad].
     """
-    lower, upper = angle_limits(arm)
+    lower, upper = arm.angle_limits
 
     def newton(pose: NearestPose, _: None) -> tuple[NearestPose, None]:
         qpos = pose.qpos

@@ -10,9 +10,17 @@ import pytest
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, lock_joints, masked_arrays
 from mimic.metric.kinematics import link_states
-from mimic.physics.dynamics import torque_of_arm
 from tests.helpers import random_arms
-from tests.helpers.array_cases import acceleration, arm_of, assert_near, looped, padded, random_motion, unrolled
+from tests.helpers.array_cases import (
+    acceleration,
+    arm_of,
+    assert_near,
+    looped,
+    padded,
+    random_motion,
+    torque_of_arm,
+    unrolled,
+)
 
 _BODY = '<inertial pos="0.1 0.02 -0.03" mass="{}" diaginertia="0.002 0.003 0.004"/>'
 _SITE = '<site name="tip" type="sphere" pos="0.2 0.1 0.05"/>'

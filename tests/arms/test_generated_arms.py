@@ -11,7 +11,7 @@ from mimic.metric.kinematics import link_state_table, link_states
 from mimic.physics import dynamics
 from mimic.physics.joint_numbers import joints_of_model
 from tests.helpers import random_arms
-from tests.helpers.array_cases import Batch, random_source
+from tests.helpers.array_cases import Batch, random_source, torque_of_arm
 
 SEEDS = range(5000, 5100)  # no other test has them
 RTOL = 1e-12  # of the largest number of an arm's result
@@ -41,7 +41,7 @@ def test_link_states(x64, batch):
 
 
 def test_inverse_dynamics(x64, batch):
-    as_data = jax.jit(jax.vmap(dynamics.torque_of_arm))(batch.arrays, batch.qpos, batch.qvel, batch.qacc)
+    as_data = jax.jit(jax.vmap(torque_of_arm))(batch.arrays, batch.qpos, batch.qvel, batch.qacc)
     for arm, motion, torque in zip(batch.arms, batch.motions, np.asarray(as_data), strict=True):
         *state, expected = motion
         constant = dynamics.inverse(joints_of_model(arm.model), *(x.tolist() for x in state), trigonometry)

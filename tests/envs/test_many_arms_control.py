@@ -11,7 +11,7 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arm import torque_scale as scale_of_one_arm
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
 from mimic.envs import many_arms_control as control
-from mimic.physics.physics import make_advance
+from mimic.physics.composite_kernel import make_advance
 from mimic.physics.step import Load
 from mimic.retargeting.array_nearest import NearestPose
 

@@ -75,6 +75,12 @@ def unrolled(arm, qpos, qvel, torque, mass: Any = 1.0, damping: Any = 1.0, base:
     return jnp.stack(dynamics.acceleration(joints, *state, base, cosine_and_sine))
 
 
+def torque_of_arm(arm, qpos, qvel, qacc):
+    """Inverse dynamics of an arm as data; 0 for locked joints."""
+    joints = unpacked(joint_numbers(arm))
+    return arm.is_free * jnp.stack(dynamics.inverse(joints, list(qpos), list(qvel), list(arm.is_free * qacc)))
+
+
 def padded(values) -> Any:
     """Values of an arm's own joints, with 0 for the empty slots."""
     return np.pad(values, (0, MAX_JOINTS - len(values)))

@@ -7,7 +7,7 @@ import pytest
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import arm_arrays, stack_arms
 from mimic.evaluation.rollout_metrics import measure_similarity
-from mimic.metric.similarity import MEASURES, centre_line, centre_line_table, motion_similarity
+from mimic.metric.similarity import MEASURES, centre_line, centre_line_table, similarity
 from tests.helpers.array_cases import padded
 
 TIMES = 20
@@ -51,7 +51,11 @@ def batch():
     """The cases, the Panda as their expert with its poses, and the measures [cases, T] of one compiled function."""
     arms = cases()
     expert, expert_qpos = arms[0][0].astype(np.float32), random_poses(7, 10)
-    measure = jax.jit(jax.vmap(motion_similarity, (None, 0, None, 0)))
+
+    def of_arm(expert, arm, expert_qpos, qpos):
+        return similarity(centre_line(expert, expert_qpos), centre_line(arm, qpos))
+
+    measure = jax.jit(jax.vmap(of_arm, (None, 0, None, 0)))
     learners = stack_arms([arm[0] for arm in arms]).astype(np.float32)
     values = measure(expert, learners, wide(expert_qpos), np.stack([arm[1] for arm in arms]))
     return arms, expert_qpos, jax.tree.map(np.asarray, values)

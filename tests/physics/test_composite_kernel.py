@@ -7,9 +7,8 @@ import pytest
 
 from mimic.arms.arrays import MAX_JOINTS, lock_joints
 from mimic.base.fused_kernel import LaunchConfig
-from mimic.physics.composite_kernel import gpu_kernel
+from mimic.physics.composite_kernel import gpu_kernel, make_advance
 from mimic.physics.joint_numbers import joint_numbers
-from mimic.physics.physics import make_advance
 from mimic.physics.step import Load
 from mimic.physics.trigonometry import cosine_and_sine
 from tests.helpers.array_cases import Batch, random_source

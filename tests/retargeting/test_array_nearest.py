@@ -10,7 +10,7 @@ from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
 from mimic.metric.correspondence import arc_length_correspondence
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import link_states
-from mimic.retargeting.array_nearest import angle_limits, nearest_pose, pose_quadratic
+from mimic.retargeting.array_nearest import nearest_pose, pose_quadratic
 
 WEIGHTS = DistanceWeights(1.0, 1.0, 0.0, 0.0)
 LOCKED = np.array([0, 0, 1, 0, 0, 1, 1, 0])
@@ -65,7 +65,7 @@ def test_poses_stay_within_ranges(x64, panda):
     qpos, qvel = motion(5)
     ranges = np.where(np.arange(MAX_JOINTS)[:, None] == 1, [[-0.1, 0.2]], panda.joint_range)
     learner = panda.replace(joint_range=ranges)
-    lower, upper = angle_limits(learner)
+    lower, upper = learner.angle_limits
     assert lower[1] == -0.1 and upper[1] == 0.2 and np.isinf(lower[0])  # the others rotate by a full revolution
     expert, matrix = link_states(panda, qpos, qvel), arc_length_correspondence(panda, panda)
     found, *_ = nearest_pose(learner, WEIGHTS, matrix, expert, jnp.zeros(MAX_JOINTS), 10)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import ArmArrays
 from mimic.metric.kinematics import link_states
-from mimic.metric.similarity import motion_similarity
+from mimic.metric.similarity import centre_line, similarity
 from mimic.retargeting.pose import imitate_pose
 from mimic.trainers.pose_mapper.model import MapperModel, Params
 from mimic.trainers.pose_mapper.pair import Pair, Target, random_poses
@@ -196,7 +196,12 @@ def mean_similarity(
     pairs: Pairs, poses: Mapping[str, Float[Any, "pairs poses joints"]]
 ) -> dict[str, dict[str, Float[np.ndarray, " pairs"]]]:
     """Means over the learners' poses of the measures of `mimic.metric.similarity`, as {method: {measure: [pairs]}}."""
-    measure = jax.jit(lambda qpos: jax.lax.map(lambda x: motion_similarity(*x), (*pairs, qpos)))
+
+    def of_pair(pair: Any) -> dict[str, Array]:
+        expert, learner, expert_qpos, qpos = pair
+        return similarity(centre_line(expert, expert_qpos), centre_line(learner, qpos))
+
+    measure = jax.jit(lambda qpos: jax.lax.map(of_pair, (*pairs, qpos)))
     return {
         name: {key: np.asarray(value).mean(axis=1, dtype=float) for key, value in measure(jnp.asarray(qpos)).items()}
         for name, qpos in poses.items()

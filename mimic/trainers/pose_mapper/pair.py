@@ -14,7 +14,7 @@ from mimic.arms.pose_limits import continuous_joints
 from mimic.metric.correspondence import arc_length_correspondence
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates, link_states
-from mimic.retargeting.array_nearest import angle_limits, nearest_pose
+from mimic.retargeting.array_nearest import nearest_pose
 
 Arm = Embodiment | ArmArrays  # of the latter, poses have an angle for each slot of a joint
 Poses = Float[Array, "poses joints"]
@@ -108,11 +108,11 @@ def poses_within_range(arm: Arm, outputs: Float[Array, "*batch joints 2"], *, on
     """
     if isinstance(arm, ArmArrays):
         lower, upper = arm.joint_range[:, 0], arm.joint_range[:, 1]
-        continuous, zero = jnp.isinf(angle_limits(arm)[0]), arm.home
+        zero = arm.home
     else:
         lower, upper = (jnp.asarray(bound, outputs.dtype) for bound in np.asarray(arm.joint_range).T)
-        continuous, zero = continuous_joints(arm), 0.0
+        zero = 0.0
     poses = (lower + upper) / 2 + (upper - lower) / 2 * jnp.tanh(outputs[..., 0])
     if on_circle:
-        poses = jnp.where(continuous, zero + jnp.arctan2(outputs[..., 1], outputs[..., 0]), poses)
+        poses = jnp.where(continuous_joints(arm), zero + jnp.arctan2(outputs[..., 1], outputs[..., 0]), poses)
     return at_home_where_locked(arm, poses)

@@ -10,7 +10,7 @@ import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, stack_arms
-from mimic.physics.physics import make_advance
+from mimic.physics.composite_kernel import make_advance
 from mimic.physics.step import Load
 from tests.helpers.lowering import gpu_program
 
