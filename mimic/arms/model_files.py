@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from mimic.arms.compile_check import VELOCITY_LIMIT, check_in_process, check_magnitudes
 from mimic.arms.model_source import ModelSource, read_source
@@ -67,6 +68,7 @@ def _read(path: str | os.PathLike[str]) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
                 model = spec.compile()
             if source is not None:
                 check_magnitudes(model)
+                _warn(shown, (), tuple(_empty_ranges(model)))
     except (ValueError, mujoco.FatalError) as error:
         raise ValueError(_reason(shown, " ".join(str(error).split()))) from error
     if source is not None:
@@ -134,6 +136,13 @@ def _warn(shown: str, missing: tuple[str, ...], notes: tuple[str, ...]) -> None:
         _log.warning("%s: ignored %d meshes that cannot be read, the first %s", shown, len(missing), missing[0])
     for note in notes:
         _log.warning("%s: %s", shown, note)
+
+
+def _empty_ranges(model: mujoco.MjModel) -> Iterator[str]:
+    """Lines about joints whose range MuJoCo ignores, since it ends before it starts."""
+    for joint in np.flatnonzero((model.jnt_limited == 0) & (model.jnt_range[:, 0] > model.jnt_range[:, 1])):
+        low, high = model.jnt_range[joint]
+        yield f"the range of joint {model.joint(joint).name!r} goes from {low:g} down to {high:g}: none is assumed"
 
 
 def _name_unnamed(spec: mujoco.MjSpec) -> bool:

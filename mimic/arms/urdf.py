@@ -23,6 +23,10 @@ _NOTICED, _NOTICED_INERTIA = 1e-5, 1e-9  # corrections from which a line says so
 _POINT_RADIUS = 1e-3  # m, radius of gyration of a body with a mass and no inertia
 # A link that moves and states no inertia. Without gravity, torques scale with the mass of the whole arm.
 _ASSUMED_MASS, _ASSUMED_LIGHT, _ASSUMED_RADIUS = 1.0, 1e-3, 0.1  # kg; where others have a mass; m
+# Geometries by their sizes, with as many numbers as they have.
+_SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1}, "mesh": {},
+          "capsule": {"radius": 1, "length": 1}}  # fmt: skip
+_MAX_MASS, _MAX_INERTIA = MAX_VALUES["mass [kg]"][0], MAX_VALUES["inertia [kg m^2]"][0]
 _MAX_RANGE, _MAX_TORQUE = MAX_VALUES["joint range [rad or m]"][0], MAX_VALUES["torque limit [N m]"][0]
 _MAX_NAMES = 6  # in a line
 _EXPRESSION = re.compile(r"\$[{(]")
@@ -52,14 +56,17 @@ def mend_urdf(root: _Element) -> tuple[str, ...]:
         if duplicates:
             raise ValueError(f"two {tag}s are called {duplicates[0]!r}; expected one name each")
     stated_velocities(root)
-    for link in root.findall("link"):
-        _drop_empty_shapes(link)
+    links = root.findall("link")
+    empty = [link.get("name", "") for link in links if _drop_empty_shapes(link)]
     for joint in root.findall("joint"):
         _drop_torque_limit(joint)
         for axis in (axis for axis in joint.findall("axis") if "xyz" not in axis.attrib):
             joint.remove(axis)  # URDF's default is that of MuJoCo
-    corrected = [link.get("name", "") for link in root.findall("link") if _correct_inertia(link)]
+    massless = [link.get("name", "") for link in links if _drop_mass(link)]
+    corrected = [link.get("name", "") for link in links if _correct_inertia(link)]
     lines = {
+        "ignored the shapes without a size of {}": empty,
+        "ignored the inertia of {}, whose mass no body has": massless,
         "corrected the inertia of {}, which no body has, to the nearest physical one": corrected,
         **_assume_inertia(root),
         **_mend_limits(root.findall("joint")),
@@ -86,38 +93,59 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:_MAX_NAMES]) + more
 
 
-def _number(element: _Element, attribute: str, what: str, default: str = "0") -> float:
-    text = element.get(attribute, default)
+def _number(element: _Element, attribute: str, what: str, nan: float | None = None) -> float:
+    """An attribute, 0 where it is absent; `nan` stands for one that is not a number, else that is an error."""
+    text = element.get(attribute, "0")
     try:
         value = float(text)
     except ValueError:
-        value = math.nan
-    if math.isnan(value):
+        raise ValueError(f"{what}: expected a number, got {text!r:.80}") from None
+    if math.isnan(value) and nan is None:
         raise ValueError(f"{what}: expected a number, got {text!r:.80}")
-    return value
+    return value if nan is None or math.isfinite(value) else nan
 
 
 # --- shapes and inertia -----------------------------------------------------------------------------------------------
 
 
-def _drop_empty_shapes(link: _Element) -> None:
-    """Removes boxes, spheres and cylinders without a size, a placeholder of some exporters, and names of shapes."""
-    for shape in [child for child in link if child.tag in ("visual", "collision")]:
+def _drop_empty_shapes(link: _Element) -> bool:
+    """Removes shapes without a size, a placeholder of some exporters; returns whether there were any."""
+    shapes = [child for child in link if child.tag in ("visual", "collision")]
+    empty = [shape for shape in shapes if not any(map(_has_size, shape.iterfind("geometry/*")))]
+    for shape in shapes:
         shape.attrib.pop("name", None)  # MuJoCo warns of equal ones
-        sizes = " ".join(
-            element.get(name, "1")
-            for element in shape.iter()
-            for name in {"box": ["size"], "sphere": ["radius"], "cylinder": ["radius", "length"]}.get(element.tag, [])
-        )
-        if any(not _is_above_zero(size) for size in sizes.split()):
-            link.remove(shape)
+    for shape in empty:
+        link.remove(shape)
+    return bool(empty)
 
 
-def _is_above_zero(text: str) -> bool:
+def _has_size(geometry: _Element) -> bool:
+    """Whether a geometry is one that MuJoCo reads, with a size."""
+    counts = _SIZES.get(geometry.tag, {})
+    scale = geometry.get("scale", "1 1 1")
+    values = {name: [_size(x) for x in geometry.get(name, "").split()] for name in counts}
+    is_scaled = len(scale.split()) == 3 and all(_size(x) for x in scale.split())
+    return (
+        bool(geometry.tag in _SIZES)
+        and is_scaled
+        and all(len(values[name]) == count and min(values[name]) > 0 for name, count in counts.items())
+    )
+
+
+def _size(text: str) -> float:
     try:
-        return float(text) > 0
+        return float(text)
     except ValueError:
-        return True  # left to MuJoCo's own message
+        return 0.0
+
+
+def _drop_mass(link: _Element) -> bool:
+    """Makes a link without a mass above 0 a mere frame; returns whether it states an impossible mass."""
+    inertial, mass = link.find("inertial"), _mass(link)
+    if inertial is None or 0 < mass <= _MAX_MASS:
+        return False
+    _set_inertia(inertial, 0.0, np.zeros((3, 3)))
+    return mass != 0
 
 
 def _correct_inertia(link: _Element) -> bool:
@@ -126,15 +154,11 @@ def _correct_inertia(link: _Element) -> bool:
     A body's second moments of mass, tr(I)/2 - I, have no negative principal value (Wensing, Kim and Slotine 2018);
     negative ones are set to zero.
     """
-    inertial = link.find("inertial")
-    if inertial is None:
+    inertial, mass, inertia = link.find("inertial"), _mass(link), _inertia(link)
+    if inertial is None or mass == 0:
         return False
     for element in inertial.findall("inertia"):
         element.attrib.update({name: "0" for name in _MOMENTS if name not in element.attrib})
-    mass, inertia = _mass(link), _inertia(link)
-    if mass <= 0:  # as a frame; what it states besides has no body
-        _set_inertia(inertial, 0.0, np.zeros((3, 3)))
-        return mass < 0 or bool(np.any(inertia))
     second = np.trace(inertia) / 2 * np.eye(3) - inertia
     values, axes = np.linalg.eigh(second)
     scale = max(float(np.abs(values).sum()), mass * _POINT_RADIUS**2)
@@ -151,17 +175,16 @@ def _correct_inertia(link: _Element) -> bool:
 
 def _mass(link: _Element) -> float:
     mass = link.find("inertial/mass")
-    value = 0.0 if mass is None else _number(mass, "value", f"the mass of link {link.get('name', '')!r}")
-    return value if math.isfinite(value) else 0.0
+    return 0.0 if mass is None else _number(mass, "value", f"the mass of link {link.get('name', '')!r}", nan=-1.0)
 
 
 def _inertia(link: _Element) -> np.ndarray:
     element, what = link.find("inertial/inertia"), f"the inertia of link {link.get('name', '')!r}"
     if element is None:
         return np.zeros((3, 3))
-    xx, xy, xz, yy, yz, zz = (_number(element, name, what) for name in _MOMENTS)
+    xx, xy, xz, yy, yz, zz = (_number(element, name, what, nan=math.inf) for name in _MOMENTS)
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return inertia if np.all(np.isfinite(inertia)) else np.zeros((3, 3))
+    return inertia if np.all(np.abs(inertia) <= _MAX_INERTIA) else np.zeros((3, 3))
 
 
 def _set_inertia(inertial: _Element, mass: float, inertia: np.ndarray) -> None:

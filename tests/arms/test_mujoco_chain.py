@@ -204,6 +204,15 @@ def test_velocity_limits_of_an_arm_on_a_lift(numbers, expected):
         load_mjcf(model(lift, numeric))
 
 
+def test_a_range_that_mujoco_ignores_is_a_line(tmp_path, caplog):
+    (tmp_path / "arm.xml").write_text(
+        '<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" range="2 -2"/>'
+        '<geom size="0.1" pos="1 0 0"/></body></worldbody></mujoco>'
+    )
+    assert load_mjcf(tmp_path / "arm.xml").joint_range[0] == pytest.approx((-np.pi, np.pi))
+    assert "the range of joint 'a' goes from 2 down to -2: none is assumed" in caplog.text
+
+
 def test_attached_models_keep_their_velocity_limits_and_start_poses(tmp_path):
     rest = '<custom><numeric name="velocity_limit" data="{0} 2"/></custom>'
     rest += '<keyframe><key name="home" qpos="0.{0} 0.2"/></keyframe>'

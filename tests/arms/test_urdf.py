@@ -54,6 +54,9 @@ def fixed(link, content=""):
         (1.0, (0.1, 0.3, 0.5), (0.5, 0.35, 0.15)),  # a' = (a + c - b) / 2, b' = (b + c - a) / 2
         (0.0, (0.1, 0.1, 0.1), (0, 0, 0)),
         (-1.0, (0.1, 0.1, 0.1), (0, 0, 0)),
+        ("nan", (0.1, 0.1, 0.1), (0, 0, 0)),
+        (1e7, (0.1, 0.1, 0.1), (0, 0, 0)),
+        (3.0, (float("nan"), 0.1, 0.1), (2e-6, 2e-6, 2e-6)),  # a ball whose radius of gyration is 1 mm
         (2.0, (0.2, 0.2, 0.2), (0.2, 0.2, 0.2)),
     ],
 )
@@ -130,11 +133,21 @@ def shape(geometry):
     return f"<collision><geometry>{geometry}</geometry></collision>"
 
 
-@pytest.mark.parametrize(
-    "geometry", ['<box size="0 0 0"/>', '<sphere radius="0"/>', '<cylinder radius="1" length="0"/>']
-)
-def test_shapes_without_a_size_are_left_out(read, geometry):
+NOTHING = [
+    "",
+    "<plane/>",
+    "<box/>",
+    '<box size="0 0 0"/>',
+    '<box size="-1 1 1"/>',
+    '<sphere radius="0"/>',
+    '<cylinder radius="1" length="0"/>',
+]
+
+
+@pytest.mark.parametrize("geometry", NOTHING)
+def test_shapes_without_a_size_are_left_out(read, caplog, geometry):
     assert read(parts=fixed("tag", shape(geometry)))[1].ngeom == 0
+    assert "ignored the shapes without a size of tag" in caplog.text
 
 
 @pytest.mark.parametrize("content", [POINTER.encode(), FLAT], ids=["a pointer of Git LFS", "flat"])
