@@ -3,10 +3,11 @@
 Nothing is changed or left out without a note.
 """
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mimic.motions.formats.episodes import Motion
 from mimic.motions.resampling import angles_and_velocities
@@ -16,8 +17,9 @@ _MAX_ANGLE = 4 * np.pi  # rad, of such a joint: beyond, the angles are no rad
 _MAX_TURNS = 2  # by which a joint is rotated into its range
 OVERSHOOT = 0.02  # rad, 1 degree: how far measured angles may lie beyond a joint's range
 # A jump is what a joint cannot do between two samples: a step of more than 0.15 rad (9 deg) that would need more than
-# 100 rad/s^2, several times what arms reach, and that the samples before and after do not continue.
-_JUMP, _MAX_ACCELERATION = 0.15, 100.0
+# 100 rad/s^2, several times what arms reach, or 3 rad/s more than before and after.
+_JUMP, _MAX_ACCELERATION, _MAX_SPEED = 0.15, 100.0, 3.0
+_ASTRAY = 3  # samples between a jump and the one back, which are a fault of the recording
 _GAP, _GAP_SAMPLES, _GAP_MOTION = 0.5, 5.0, 0.05  # s, median intervals, rad: no samples for longer, while a joint moved
 _LATE, _MOST_LATE = 0.1, 0.1  # s, fraction: samples that arrive out of order are few and late by less
 _DOUBLED = 0.01  # of the usual interval: equal samples within it are one that was published twice
@@ -115,15 +117,12 @@ def _in_order(time: np.ndarray) -> np.ndarray:
 
 
 def _without_jumps(name: str, motion: Motion, joint_names: Sequence[str], notes: Notes) -> Iterator[Motion]:
-    """The parts between jumps of a joint, and between gaps in which a joint moved."""
-    interval, change = np.diff(motion.time), np.diff(motion.qpos, axis=0)
-    if not len(interval):
-        return
-    velocity = change / interval[:, None]
-    padded = np.concatenate([velocity[1:2], velocity, velocity[-2:-1]]) if len(velocity) > 1 else velocity[[0, 0, 0]]
-    surprise = np.min([np.abs(change - padded[i : i + len(change)] * interval[:, None]) for i in (0, 2)], axis=0)
-    jumps = surprise > _JUMP + _MAX_ACCELERATION * interval[:, None] ** 2 / 4
-    is_long = interval > max(_GAP, _GAP_SAMPLES * float(np.median(interval)))
+    """The parts between jumps of a joint, and between gaps in which a joint moved, without samples that jump away."""
+    if (kept := _not_astray(motion)) is not None:
+        notes.add("samples that jump away and back left out", f"{np.sum(~kept)} of {len(kept)} in {name}")
+        motion = motion.take(kept)
+    interval, change, jumps = np.diff(motion.time), np.diff(motion.qpos, axis=0), _jumps(motion)
+    is_long = interval > max(_GAP, _GAP_SAMPLES * float(np.median(interval))) if len(interval) else np.zeros(0, bool)
     gaps = is_long & np.any(np.abs(change) > _GAP_MOTION, axis=1)
     for sample, joint in np.argwhere(jumps)[:1]:
         notes.add(
@@ -137,6 +136,28 @@ def _without_jumps(name: str, motion: Motion, joint_names: Sequence[str], notes:
             f"{name}, {np.sum(gaps)} times, first {interval[sample]:.3g} s from {motion.time[sample]:g} s",
         )
     yield from map(motion.take, np.split(np.arange(len(motion.time)), np.flatnonzero(jumps.any(axis=1) | gaps) + 1))
+
+
+def _jumps(motion: Motion) -> Bool[np.ndarray, "intervals joints"]:
+    """Whether a joint jumps between two samples."""
+    interval, change = np.diff(motion.time)[:, None], np.diff(motion.qpos, axis=0)
+    if len(interval) < 2:
+        return np.zeros(change.shape, bool)
+    velocity = change / interval
+    before, after = np.concatenate([velocity[1:2], velocity[:-1]]), np.concatenate([velocity[1:], velocity[-2:-1]])
+    surprise = np.min([np.abs(change - expected * interval) for expected in (0, before, after)], axis=0)
+    return surprise > _JUMP + np.minimum(_MAX_ACCELERATION * interval**2 / 4, _MAX_SPEED * interval)
+
+
+def _not_astray(motion: Motion) -> Bool[np.ndarray, " samples"] | None:
+    """The samples but those few between a jump away and the jump back; None where there are none of them."""
+    rows = np.flatnonzero(_jumps(motion).any(axis=1))
+    kept = np.ones(len(motion.time), bool)
+    for first, last in itertools.pairwise(rows):
+        back = np.abs(motion.qpos[last + 1] - motion.qpos[first]).max() < _JUMP
+        if back and last - first <= _ASTRAY and kept[first]:
+            kept[first + 1 : last + 1] = False
+    return None if kept.all() else kept
 
 
 def _in_range(
@@ -167,7 +188,7 @@ def _in_range(
         lower, upper = bounds[joint]
         raise ValueError(
             f"source: {joint_names[joint]} of {name} is at {motion.qpos[sample, joint]:.4g}, "
-            f"expected rad in [{lower:.4f}, {upper:.4f}]"
+            f"expected rad in [{lower:.4f}, {upper:.4f}]" + "; limits=none takes it" * bool(~turns_on[joint])
         )
     if beyond[sample, joint] > 1e-6:  # float32 rounds pi by 9e-8
         notes.add(

@@ -84,7 +84,27 @@ def test_slow_samples_jump_too_and_fast_motions_do_not():
     assert len(clean(motion)[0]) == 1
     motion.qpos[30:, 0] += 1.0
     assert len(clean(motion)[0]) == 2
+    slowest = swing(np.arange(0, 6, 0.2))
+    slowest.qpos[15:, 0] += 1.0
+    assert len(clean(slowest)[0]) == 2
     assert len(clean(swing(amplitude=3.0))[0]) == 1  # 6 rad/s, 12 rad/s^2
+
+
+def test_samples_that_jump_away_and_back_are_left_out():
+    motion = swing()
+    motion.qpos[100:102, 0] = 2.0
+    (rest,), (line,) = clean(motion)
+    assert len(rest.time) == 298 and line == "samples that jump away and back left out: 2 of 300 in swing"
+
+
+def test_stamps_a_moment_apart_are_no_jump():
+    """A reader that was late gives many samples nearly the same stamp, and then a long interval."""
+    rng = np.random.default_rng(0)
+    true = np.arange(0, 6, 1e-3)
+    stamps = np.maximum.accumulate(true + rng.exponential(5e-4, len(true))) + 1e-9 * np.arange(len(true))
+    for qvel in (None, swing(true).qvel):
+        (motion,), lines = clean(Motion(stamps, swing(true).qpos, qvel))
+        assert len(motion.time) == len(true) and not lines
 
 
 def test_gaps_split_a_motion_unless_it_holds_still():
