@@ -186,9 +186,10 @@ def _in_range(
     sample, joint = np.unravel_index(np.argmax(beyond), beyond.shape)
     if beyond[sample, joint] > OVERSHOOT:
         lower, upper = bounds[joint]
+        takes = not turns_on[joint] and abs(motion.qpos[sample, joint]) <= _MAX_ANGLE
         raise ValueError(
             f"source: {joint_names[joint]} of {name} is at {motion.qpos[sample, joint]:.4g}, "
-            f"expected rad in [{lower:.4f}, {upper:.4f}]" + "; limits=none takes it" * bool(~turns_on[joint])
+            f"expected rad in [{lower:.4f}, {upper:.4f}]" + "; limits=none takes it" * bool(takes)
         )
     if beyond[sample, joint] > 1e-6:  # float32 rounds pi by 9e-8
         notes.add(

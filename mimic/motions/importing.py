@@ -77,11 +77,10 @@ def import_demonstrations(
         notes.append(
             f"shorter than {duration:g} s, and left out: {short[0]}" + f", and {len(short) - 1} more" * (len(short) > 1)
         )
-    if len(windows) > len(recording.motions) - len(short) or lost:
+    whole = len(recording.motions) - len(short)
+    if len(windows) > whole or lost:
         left = f"; {lost:.3g} s at their ends are left out" if lost else ""
-        notes.append(
-            f"windows of {duration:g} s: {len(windows)}, of {len(recording.motions) - len(short)} motions{left}"
-        )
+        notes.append(f"windows of {duration:g} s: {len(windows)}, of {_count(whole)}{left}")
     demonstrations = _demonstrations(windows, arm, dt, recording.gripper)
     if recording.gripper and demonstrations.gripper is None:
         notes.append(f"gripper left out, since some motions have no values of {', '.join(recording.gripper)}")
@@ -152,8 +151,11 @@ def _summary(motions: Mapping[str, Motion]) -> str:
     source = {len(motions): "from the source", 0: "computed from the angles"}.get(
         stated, f"from the source in {stated}"
     )
-    count = f"{len(motions)} motion{'s' * (len(motions) > 1)}"
-    return f"{count}, {seconds:.4g} s, {1 / interval:.4g} samples a second; velocities: {source}"
+    return f"{_count(len(motions))}, {seconds:.4g} s, {1 / interval:.4g} samples a second; velocities: {source}"
+
+
+def _count(motions: int) -> str:
+    return f"{motions} motion" + "s" * (motions != 1)
 
 
 def _read(source: Path, names: Sequence[str], topic: str, rate: float | None) -> Recording:

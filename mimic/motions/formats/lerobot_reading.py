@@ -101,8 +101,9 @@ def _features(features: Mapping[str, Any]) -> dict[str, _Feature]:
     """The features that are vectors of numbers."""
     entries: dict[str, _Feature] = {}
     for feature, form in features.items():
-        names, size = _names(form.get("names"), list(form["shape"])), list(form["shape"])
-        if form["dtype"] not in _FLOATS or size != [len(names)] or str(feature).startswith(_NO_JOINTS):
+        size = list(form.get("shape") or ())
+        names = _names(form.get("names"), size)
+        if form.get("dtype") not in _FLOATS or size != [len(names)] or str(feature).startswith(_NO_JOINTS):
             continue
         columns: dict[Quantity, dict[str, int]] = {ANGLE: {}, VELOCITY: {}}
         units = [UNITS.get(str(unit).lower(), "") for unit in form.get("units") or ()]
