@@ -230,7 +230,7 @@ def drop_zero_length(links: Iterable[Link]) -> tuple[Link, ...]:
 
 @functools.cache  # warns once, though a run builds an arm several times
 def _warn_merged(names: str) -> None:
-    _log.warning("links of length zero merged into the next link: %s", names)
+    _log.warning("links of length zero left out, as they have no direction: %s", names)
 
 
 def axis_rotation(axis: np.ndarray, angle: float) -> np.ndarray:
