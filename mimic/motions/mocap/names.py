@@ -124,8 +124,8 @@ def parts_of(names: Sequence[str]) -> list[Part | None]:
 
 def is_twist(name: str) -> bool:
     """Whether a joint only rotates a part of a segment: its place is none of the body's joints."""
-    word = "".join(_words(name)).rstrip("0123456789")
-    return "twist" in word or "捩" in word or word.endswith("roll") or word.startswith("roll")
+    word = "".join(word for word in _words(name) if word not in _SIDES).rstrip("0123456789")
+    return "twist" in word or "捩" in word or word.startswith("roll") or word.endswith(("roll", "part"))
 
 
 def is_thumb(name: str) -> bool:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mimic.motions.mocap.arms import find_arms, find_facing
+from mimic.motions.mocap.names import is_twist
 from mimic.motions.mocap.points import PointMotion
 from tests.helpers.bodies import RATE, person
 
@@ -65,6 +66,8 @@ def test_rotation_bones_halves_and_props_are_no_joints(body):
     }  # fmt: skip
     arm = find_arms(_motion(body, points, (-1, 0, 1, 2, 3, 4, 5, 5)))["left"]
     assert arm[1:] == (("LeftArm",), ("LeftForeArm",), ("LeftHand",), ("LeftHand_end",))
+    assert all(map(is_twist, ("lForearmTwist", "ForeArm_Roll_L", "ShoulderPart1_L", "左腕捩", "upperarm_twist_01_l")))
+    assert not any(map(is_twist, ("LeftForeArm", "Controller_L_Hand", "part_of_LeftHand")))
     points = {
         "upper_arm.L": "LeftArm", "upper_arm.L.001": half, "forearm.L": "LeftForeArm", "forearm.L.001": quarter,
         "hand.L": "LeftHand",
