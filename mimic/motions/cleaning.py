@@ -183,7 +183,7 @@ def _in_range(
     turns = np.where(is_outside, 2 * np.pi * turns, 0.0)
     qpos = motion.qpos - turns
     beyond = np.maximum(bounds[:, 0] - qpos, qpos - bounds[:, 1])
-    sample, joint = np.unravel_index(np.argmax(beyond), beyond.shape)
+    sample, joint = map(int, np.unravel_index(np.argmax(beyond), beyond.shape))
     if beyond[sample, joint] > OVERSHOOT:
         lower, upper = bounds[joint]
         takes = not turns_on[joint] and abs(motion.qpos[sample, joint]) <= _MAX_ANGLE

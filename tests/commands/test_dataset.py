@@ -157,7 +157,7 @@ def test_a_gripper_comes_back_from_a_dataset(recorded, tmp_path, format):
     after, _ = mimic.import_demonstrations(
         write(tmp_path / "set", demonstrations=str(path), format=format), mimic.panda()
     )
-    assert after.gripper_names == ("jaw",)
+    assert after.gripper_names == ("jaw",) and after.gripper is not None
     np.testing.assert_allclose(after.gripper, opening, atol=1e-5)  # percent in single precision
     np.testing.assert_allclose(after.qvel, before.qvel, rtol=0, atol=2e-7)
 

@@ -1,5 +1,7 @@
 """Recorded motions as they come: noise, wraps, jumps, gaps, doubled and missing samples, velocities that are wrong."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ NAMES, FREE = ("a", "b"), np.array([[-np.pi, np.pi]] * 2)
 TIME = np.arange(0, 6, 0.02)  # s
 
 
-def swing(time=TIME, amplitude=0.5):
+def swing(time=TIME, amplitude=0.5) -> Any:  # its velocities are not None
     """Two joints that swing, one of them with half the amplitude, and their velocities."""
     scale = amplitude * np.array([1, 0.5])
     return Motion(time, scale * np.sin(2 * time)[:, None], 2 * scale * np.cos(2 * time)[:, None])
@@ -52,6 +54,7 @@ def test_noise_of_dense_samples_is_no_velocity(quantum, jitter):
 def test_a_real_log_moves_as_fast_as_its_robot_says():
     recording = read_recording(PANDA_LOG, mimic.panda())
     ((_, motion),) = recording.motions.items()
+    assert motion.qvel is not None
     steps = np.arange(0, 20.9, 0.1)
     _, velocities = angles_and_velocities(motion._replace(qvel=None), steps)
     stated = np.abs(motion.qvel).max(axis=0)  # of the robot's own filter

@@ -66,6 +66,7 @@ def test_conversions():
     motion = source.motions["episode 0"]._replace(qvel=np.ones((100, 2)))
     (percent,) = in_rad(Recording({"": motion}), "percent", RANGE).motions.values()
     np.testing.assert_allclose(percent.qpos, [0, 1.5] + SWING * [2, 1.5], atol=1e-12)
+    assert percent.qvel is not None
     np.testing.assert_allclose(percent.qvel, np.tile([0.02, 0.015], (100, 1)))
     (degrees,) = in_rad(Recording({"": motion}), "deg", RANGE).motions.values()
     np.testing.assert_allclose(degrees.qpos, np.radians(motion.qpos))
@@ -91,6 +92,6 @@ def test_a_real_leader_records_degrees_and_its_follower_percent():
     )
     thousandths = np.degrees(corrected * full) * 1000
     assert np.abs(thousandths - np.round(thousandths)).max() < 0.01
-    opening = np.concatenate([motion.gripper for motion in follower.motions.values()])
+    opening = np.concatenate([motion.gripper for motion in follower.motions.values() if motion.gripper is not None])
     assert 0 <= opening.min() < 2 and 95 < opening.max() <= 100
     assert all(np.allclose(np.diff(motion.time), 1 / 15) for motion in follower.motions.values())

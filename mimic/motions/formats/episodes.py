@@ -47,7 +47,8 @@ class Motion(NamedTuple):
 
     def take(self, index: Any) -> "Motion":
         """The samples with these indices."""
-        return Motion(*(None if values is None else values[index] for values in self))
+        optional = (None if values is None else values[index] for values in (self.qvel, self.gripper))
+        return Motion(self.time[index], self.qpos[index], *optional)
 
 
 class Recording(NamedTuple):

@@ -101,7 +101,7 @@ def _features(features: Mapping[str, Any]) -> dict[str, _Feature]:
     """The features that are vectors of numbers."""
     entries: dict[str, _Feature] = {}
     for feature, form in features.items():
-        size = list(form.get("shape") or ())
+        size: list[Any] = list(form.get("shape") or ())
         names = _names(form.get("names"), size)
         if form.get("dtype") not in _FLOATS or size != [len(names)] or str(feature).startswith(_NO_JOINTS):
             continue

@@ -220,6 +220,7 @@ def _motion(rows: Sequence[tuple[int, Any]], selection: Selection) -> tuple[Moti
     if np.any(np.diff(nanoseconds) < -_RESET):
         order = np.arange(len(order))  # a clock that starts anew: `cleaned` begins a new motion there
     qpos, qvel = (_values(complete, field, selection.joints) for field in ("position", "velocity"))
+    assert qpos is not None  # `_joint_messages` keeps messages with angles alone
     motion = Motion((nanoseconds - nanoseconds.min()) / 1e9, qpos, qvel).take(order)
     if not selection.gripper:
         return motion, notes

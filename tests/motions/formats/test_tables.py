@@ -47,6 +47,7 @@ def test_tables_are_read(tmp_path, spelling):
     (motion,) = read(tmp_path, SPELLINGS[spelling]).motions.values()
     np.testing.assert_allclose(motion.time, TIME, atol=1e-6)
     np.testing.assert_allclose(motion.qpos, QPOS, atol=1e-12)
+    assert motion.qvel is not None
     np.testing.assert_allclose(motion.qvel, QVEL, atol=1e-12)
 
 
@@ -62,7 +63,7 @@ def test_units_grippers_and_missing_cells(tmp_path):
     content = text(["t", "shoulder [deg]", "elbow [deg]", "gripper"], TIME, QPOS, TIME).replace("0.500000", "")
     recording = read(tmp_path, content)
     (motion,) = recording.motions.values()
-    assert recording.unit == "deg" and recording.gripper == ("gripper",)
+    assert recording.unit == "deg" and recording.gripper == ("gripper",) and motion.gripper is not None
     np.testing.assert_allclose(motion.gripper[:, 0], np.where(np.isclose(TIME, 0.5), np.nan, TIME))
 
 
