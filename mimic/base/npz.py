@@ -13,7 +13,7 @@ from numpy.lib import format as npy
 from mimic.base.files import open_file
 
 MAX_BYTES = 2**30  # of all arrays, 8 for each value at least; 20,000 demonstrations of a Panda have 0.4 GiB
-MAX_TEXT = 2**20  # bytes of an array of text, whose values become Python objects
+MAX_TEXT = 2**23  # bytes of an array of text, whose values become Python objects
 _MAX_DIRECTORY = 2**20  # bytes of a zip archive's directory, which `zipfile` reads as a whole; mimic's own have 700
 _END, _END_SIZE = b"PK\x05\x06", 22  # the zip archive's last record, which a comment of up to 64 KiB follows
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)

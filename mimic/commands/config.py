@@ -45,7 +45,8 @@ class EvaluateConfig:
       controller: "policy", or a baseline controller (see `run_controller`).
       learner: of a run of many arms: name or file of the one arm to evaluate on. Default "": all arms of the report.
       locked: numbers or names of the joints of `learner` that are locked.
-      demonstrations: file of demonstrations that replace the held-out ones.
+      demonstrations: file of demonstrations that replace the held-out ones; episodes have their length.
+      split: "test": the test set replaces the held-out demonstrations, see `test_demonstrations`. Default "": none.
       physics: see `EnvConfig`. Default "": that of the run.
       mass, damping, torque_noise: deviation of the arm from its model, see `RandomizationConfig`. Default None: as in
         training.
@@ -67,6 +68,7 @@ class EvaluateConfig:
     learner: str = ""
     locked: list[Any] = dataclasses.field(default_factory=list)
     demonstrations: str = ""
+    split: str = ""
     physics: str = ""
     mass: float | None = _factor()
     damping: float | None = _factor()
@@ -85,6 +87,10 @@ class EvaluateConfig:
         check_choice("controller", self.controller, CONTROLLERS)
         self._check_robot()
         check_locked(self.locked, self.learner)
+        if self.split:
+            check_choice("split", self.split, ("test",))
+            if self.demonstrations or self.robot:
+                raise ValueError("split, demonstrations, robot: expected one of them, got several")
         if self.physics:
             check_choice("physics", self.physics, PHYSICS)
 

@@ -18,9 +18,9 @@ from mimic.commands.capture import MOTION_CAPTURE, prepare_capture
 from mimic.commands.config import RecordingConfig
 from mimic.commands.demonstrations_plot import plot_demonstrations
 from mimic.envs.config import EnvConfig
+from mimic.envs.imitation import recorded_demonstrations
 from mimic.motions.demonstrations import Demonstrations, check_effort
 from mimic.motions.importing import import_demonstrations
-from mimic.motions.recording import record_demonstrations
 from mimic.retargeting.self_collision import smallest_clearances, touching_line
 from mimic.trainers.progress import is_animated
 
@@ -149,16 +149,7 @@ def _record(arm: Arm, env: EnvConfig, console: Console) -> tuple[Demonstrations,
             redrawn += redrawn_goals
             bar.advance(task)
 
-        demonstrations = record_demonstrations(
-            arm,
-            config.count,
-            kind=config.kind,
-            seed=config.seed,
-            horizon=env.horizon,
-            dt=env.control_dt,
-            substeps=env.recording_substeps,
-            on_recorded=on_recorded,
-        )
+        demonstrations = recorded_demonstrations(env, arm, config.count, on_recorded=on_recorded)
     return demonstrations, redrawn
 
 

@@ -13,7 +13,7 @@ from mimic.base.config import new_folder
 from mimic.base.distribution import install_command
 from mimic.commands.config import CONTROLLERS, EvaluateConfig
 from mimic.envs.config import EnvConfig
-from mimic.motions.demonstrations import load_demonstrations
+from mimic.motions.demonstrations import Demonstrations, load_demonstrations
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.stopwatch import Stopwatch
@@ -126,13 +126,21 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
         randomization=dataclasses.replace(base.randomization, **changes),
     )
     evaluated = dataclasses.replace(trained, env=env)
-    unseen = load_demonstrations(Path(config.demonstrations).expanduser()) if config.demonstrations else None
+    unseen = _unseen(config, env)
     if env.kind == "sampled_arms":
         trainer = make_any_arm_trainer(evaluated, run_dir, unseen)
     else:
         shared = make_any_arm_trainer(trained, run_dir).shared_policy() if config.learner else None
         trainer = make_ppo_trainer(evaluated, run_dir, unseen, shared)
     return dataclasses.replace(evaluated, env=trainer.env_config), trainer
+
+
+def _unseen(config: EvaluateConfig, env: EnvConfig) -> Demonstrations | None:
+    """The demonstrations that replace the held-out ones; None where nothing does."""
+    if config.split:
+        Console().print("recording the test set; its kinematic bound takes minutes on a CPU", highlight=False)
+        return test_demonstrations(env)
+    return load_demonstrations(Path(config.demonstrations).expanduser()) if config.demonstrations else None
 
 
 def _check_commands(env: EnvConfig, controller: str) -> None:
@@ -163,7 +171,7 @@ def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
     return {
         "run": config.run,
         **({"learner": config.learner, "locked": config.locked} if config.learner else {}),
-        "demonstrations": config.demonstrations,
+        "demonstrations": config.demonstrations or config.split,
         "physics": env.physics,
         **dataclasses.asdict(env.randomization),
     }

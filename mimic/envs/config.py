@@ -11,7 +11,7 @@ from mimic.base.ranges import check_ranges, number
 from mimic.control.joint_control import MODES
 from mimic.envs.start_poses import START_POSES
 from mimic.metric.config import MetricConfig
-from mimic.motions.recording import KINDS
+from mimic.motions.experts import KINDS, MIXED
 from mimic.physics.world import AUTO, PHYSICS, RandomizationConfig, WorldConfig
 
 Kind = Literal["one_arm", "inner_loop", "sampled_arms"]
@@ -26,25 +26,29 @@ _MAX_RECORDED_STEPS = 10**8  # an hour on two cores
 class DemonstrationConfig:
     """The demonstrations: what the expert does.
 
+    There are three sets: those for training, those for validation, on which settings may be chosen, and those of
+    `python -m mimic.evaluate split=test`, which are drawn from other seeds.
+
     Attributes:
       path: file of demonstrations; where empty, demonstrations are recorded in simulation.
       source: registered function that makes the demonstrations, in place of a recording; only where `path` is empty.
-      kind: controller of the recorded demonstrations: "pd" or "reach", see `record_demonstrations`.
+      kind: what drives the expert of recorded demonstrations: "computed_torque", "pid" (paper), "reach", "splines",
+        "steps", or "mixed", each of these in turn; see `record_demonstrations`.
       count: number of training demonstrations.
-      held_out: number of held-out demonstrations, for evaluation only.
+      held_out: number of held-out demonstrations, for validation. As many of those for training are evaluated too.
       seed: random seed of the recorded goals.
     """
 
     path: str = ""
     source: str = ""
-    kind: str = "pd"
+    kind: str = MIXED
     # A core records some hundred in a second.
-    count: int = number(124, at_least=1, at_most=100_000)
-    held_out: int = number(32, at_least=1, at_most=100_000)
+    count: int = number(1000, at_least=1, at_most=100_000)
+    held_out: int = number(80, at_least=1, at_most=100_000)
     seed: int = number(0, at_least=0, at_most=2**63 - 1)
 
     def __post_init__(self) -> None:
-        check_choice("demonstrations.kind", self.kind, KINDS)
+        check_choice("demonstrations.kind", self.kind, (*KINDS, MIXED))
         check_ranges(self, "demonstrations.")
 
 

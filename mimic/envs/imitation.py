@@ -6,6 +6,7 @@ import mimic.base.quiet_mjx  # noqa: F401  # before brax
 import copy
 import dataclasses
 import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mimic.arms.arm import Arm, build_arm, torque_scale
 from mimic.arms.capsules import Capsules, fit_capsules
+from mimic.arms.drives import drives_of
 from mimic.arms.embodiment import Embodiment
 from mimic.base import compat, registry
 from mimic.envs.arm_state import ArmState, arm_state
@@ -27,6 +29,7 @@ from mimic.metric.capsule_distances import changing_pairs
 from mimic.metric.distance import LinkDistance
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 from mimic.motions.demonstrations import RECORDED_SPEED, Demonstrations, check_effort, load_demonstrations
+from mimic.motions.experts import KINDS, MIXED
 from mimic.motions.recording import record_demonstrations
 from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
 
@@ -36,6 +39,7 @@ _LIMIT_MARGIN, _LIMIT_WIDTH = 0.03, 0.1
 # Numbers that are folded into an episode's key, for its noise and for the step it starts at. 0 to 2 would give the keys
 # that `start` splits the key into.
 _NOISE, FIRST_STEP = 3, 4
+TEST_SETS, TEST_COUNT = 5, 128  # demonstrations of each kind in a set
 
 
 class ImitationEnv(Env):
@@ -93,6 +97,13 @@ class ImitationEnv(Env):
         """The same environment on other demonstrations."""
         env = copy.copy(self)
         env._set_demonstrations(demonstrations)
+        return env
+
+    def with_horizon(self, horizon: int) -> "ImitationEnv":
+        """The same environment with episodes of another length, see `Demonstrations.of_length`."""
+        env = copy.copy(self)
+        env.config = dataclasses.replace(self.config, horizon=horizon)
+        env._set_demonstrations(self.demonstrations.of_length(horizon))
         return env
 
     def with_physics(self, physics: str) -> "ImitationEnv":
@@ -408,18 +419,62 @@ def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple
                 f"count + held_out = {settings.count} + {settings.held_out}"
             )
     else:
-        loaded = record_demonstrations(
-            expert,
-            settings.count + settings.held_out,
-            kind=settings.kind,
-            seed=settings.seed,
-            horizon=config.horizon,
-            dt=config.control_dt,
-            substeps=config.recording_substeps,
-        )
+        loaded = recorded_demonstrations(config, expert, settings.count + settings.held_out)
     training = loaded.select(slice(0, settings.count))
     held_out = loaded.select(slice(settings.count, settings.count + settings.held_out))
     return training, held_out
+
+
+def recorded_demonstrations(
+    config: EnvConfig,
+    expert: Arm,
+    count: int,
+    *,
+    kind: str = "",
+    test: bool = False,
+    on_recorded: Callable[[int], None] = lambda redrawn: None,
+) -> Demonstrations:
+    """Demonstrations of a config's expert in simulation, within the limits of its manufacturer.
+
+    Args:
+      config: the config.
+      expert: its expert.
+      count: number of demonstrations.
+      kind: see `record_demonstrations`; that of the config where empty.
+      test: whether they are of the test set.
+      on_recorded: see `record_demonstrations`.
+    """
+    settings = config.demonstrations
+    return record_demonstrations(
+        expert,
+        count,
+        kind=kind or settings.kind,
+        seed=0 if test else settings.seed,
+        horizon=config.horizon,
+        dt=config.control_dt,
+        substeps=config.recording_substeps,
+        max_acceleration=drives_of(config.expert, expert).limits.acceleration,
+        test=test,
+        on_recorded=on_recorded,
+    )
+
+
+def test_demonstrations(config: EnvConfig) -> Demonstrations:
+    """The test set of a config: five sets of 128 demonstrations of each kind, from seeds that no other set has.
+
+    Settings must not be chosen by it.
+
+    Raises:
+      ValueError: demonstrations that are not recorded, or an arm whose limits allow no goal.
+    """
+    settings = config.demonstrations
+    if settings.path or settings.source:
+        raise ValueError(
+            f"split: expected none where the demonstrations are those of {settings.path or settings.source!r}, got "
+            "test; demonstrations=FILE evaluates others"
+        )
+    expert = build_arm(config.expert, config.limits, config.metric.links)
+    return recorded_demonstrations(config, expert, TEST_SETS * TEST_COUNT * len(KINDS), kind=MIXED, test=True)
 
 
 def _demonstrations_of_others(config: EnvConfig, expert: Arm) -> tuple[Demonstrations, str]:

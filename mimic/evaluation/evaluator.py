@@ -17,12 +17,20 @@ from jaxtyping import Array, Float
 from mimic.arms.pose_limits import pose_limits
 from mimic.base.compilation import Background, on_host
 from mimic.envs.imitation import ImitationEnv
-from mimic.evaluation.labels import SPLITS
+from mimic.evaluation.labels import ALL_KINDS, SPLITS
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
-from mimic.evaluation.rollout_metrics import WORST, Table, gaps, means_by_split, measure, measure_similarity
+from mimic.evaluation.rollout_metrics import (
+    WORST,
+    Table,
+    gap_interval,
+    gaps,
+    means_by_split,
+    measure,
+    measure_similarity,
+)
 from mimic.metric.kinematics import link_state_table
 from mimic.metric.similarity import CentreLine, centre_line_table
-from mimic.motions.demonstrations import Demonstrations, concatenate
+from mimic.motions.demonstrations import Demonstrations, concatenate, effective_rank
 from mimic.retargeting.kinematic_bound import closest_motion
 from mimic.retargeting.pose import shared_joints
 from mimic.retargeting.pose_baselines import baseline_poses
@@ -30,6 +38,7 @@ from mimic.runs.files import write_csv
 
 Controller = Callable[[State], Array]  # (state of the environment) -> action
 Motions = Float[np.ndarray, "demonstrations time joints"]
+EVALUATED_TRAINING = 80  # demonstrations for training that are evaluated, or as many as those held out
 
 
 @struct.dataclass
@@ -64,12 +73,13 @@ class Evaluator:
       held_out: demonstrations for evaluation only.
 
     Attributes:
-      env: the training environment on all demonstrations, those for training first.
+      env: the training environment on the evaluated demonstrations, those for training first.
     """
 
     def __init__(self, env: ImitationEnv, held_out: Demonstrations):
-        self._num_train = env.demonstrations.count
-        self.env = env.with_demonstrations(concatenate(env.demonstrations, held_out))
+        training = env.demonstrations.select(slice(0, max(EVALUATED_TRAINING, held_out.count)))
+        self._num_train = training.count
+        self.env = env.with_demonstrations(concatenate(training, held_out))
         self._references = Background(lambda: _references(self.env))
 
     def on_mjx(self) -> "Evaluator":
@@ -192,12 +202,29 @@ class Evaluator:
         return {
             "optimality_gap": {split: float(gaps(*(mean[split] for mean in means.values()))) for split in SPLITS},
             **means,
+            "by_kind": self._by_kind(table),
+            "effective_rank": {
+                split: effective_rank(self.env.demonstrations.select(part)) for split, part in parts.items()
+            },
             **{
                 key: by_split(values, np.sum if key.endswith("violations") else np.mean)
                 for key, values in table.items()
                 if key not in means and key != "optimality_gap"
             },
         }
+
+    def _by_kind(self, table: Table) -> dict[str, dict[str, dict[str, float]]]:
+        """The gap of each kind of demonstrations and of all, with its interval, as {kind: {split: {name: number}}}."""
+        columns = np.stack([table[key] for key in ("mean_distance", "lower_bound", "hold_distance")])
+        kinds = np.array(self.env.demonstrations.kinds)
+        result: dict[str, dict[str, dict[str, float]]] = {}
+        for kind in (*dict.fromkeys(kinds.tolist()), ALL_KINDS):
+            for split, part in self.parts.items():
+                distance, bound, hold = columns[:, part][:, (kinds[part] == kind) | (kind == ALL_KINDS)]
+                if len(distance):
+                    numbers = zip(("optimality_gap", "low", "high"), gap_interval(distance[None], bound, hold))
+                    result.setdefault(kind, {})[split] = {**dict(numbers), "demonstrations": len(distance)}
+        return result
 
     def worst(self, rollouts: Rollouts) -> dict[str, dict[str, float]]:
         """The largest gaps of each split, by number of the demonstration."""
@@ -223,8 +250,9 @@ class Evaluator:
         """Writes the table as CSV, with the split and the number of each demonstration."""
         table = {**self.table(rollouts), **self.similarity(np.asarray(rollouts.qpos))}
         numbers = [(split, i) for split, part in self.parts.items() for i in range(len(self.hold_distance[part]))]
-        rows = [(*number, *row) for number, *row in zip(numbers, *table.values(), strict=True)]
-        write_csv(out, ["split", "demonstration", *table], rows)
+        kinds = self.env.demonstrations.kinds
+        rows = [(*number, *row) for number, *row in zip(numbers, kinds, *table.values(), strict=True)]
+        write_csv(out, ["split", "demonstration", "kind", *table], rows)
 
 
 class References(NamedTuple):

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 SPLITS = ("train", "held_out")
+ALL_KINDS = "all"
 SIMILARITY_HEADERS = {  # positions in chain lengths
     "centre_line_distance": "centre\nline",
     "tangent_angle_deg": "tangent\nangle",

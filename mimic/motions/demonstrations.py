@@ -13,7 +13,8 @@ from mimic.base.npz import read_arrays
 
 FORMAT = "mimic-demonstrations-1"
 _ARRAYS = ("qpos", "qvel", "goals", "dt", "seed", "arm", "joint_names", "format")
-_OPTIONAL_ARRAYS = ("torque", "gripper", "gripper_names")
+_OPTIONAL_ARRAYS = ("torque", "gripper", "gripper_names", "kinds")
+CLIPS = "clips"  # kind of the motions of a file that does not say what drove them
 MAX_VALUE = 1e6  # rad, rad/s, N m, s: no arm's motion has larger values
 _ROUNDING = 1e-6  # relative tolerance of a value above its limit: a file in float32 rounds by 6e-8
 RECORDED_SPEED = 3.0  # times the model's velocity limit, which a recorded joint may have: some state 1 rad/s for all
@@ -34,6 +35,7 @@ class Demonstrations:
       torque: [N, T, n] torque between each sample and the next [N m], without gravity compensation; None if unknown.
       gripper: [N, T+1, m] joints or opening of the gripper, in the units of their source; None if unknown.
       gripper_names: its channels.
+      kinds: [N] what drove the expert, see `record_demonstrations`; "clips" for motions of a file that does not say.
     """
 
     qpos: Float[np.ndarray, "demonstrations samples joints"]
@@ -46,6 +48,11 @@ class Demonstrations:
     torque: Float[np.ndarray, "demonstrations steps joints"] | None = None
     gripper: Float[np.ndarray, "demonstrations samples channels"] | None = None
     gripper_names: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.kinds:
+            object.__setattr__(self, "kinds", (CLIPS,) * len(self.qpos))
 
     @property
     def count(self) -> int:
@@ -60,8 +67,15 @@ class Demonstrations:
     def select(self, index: slice | Sequence[int]) -> "Demonstrations":
         """The demonstrations with these indices."""
         torque, gripper = (None if values is None else values[index] for values in (self.torque, self.gripper))
+        kinds = tuple(map(str, np.array(self.kinds, dtype=str)[index]))
         return dataclasses.replace(
-            self, qpos=self.qpos[index], qvel=self.qvel[index], goals=self.goals[index], torque=torque, gripper=gripper
+            self,
+            qpos=self.qpos[index],
+            qvel=self.qvel[index],
+            goals=self.goals[index],
+            torque=torque,
+            gripper=gripper,
+            kinds=kinds,
         )
 
     def of_length(self, steps: int) -> "Demonstrations":
@@ -93,6 +107,7 @@ class Demonstrations:
                 seed=np.array(self.seed),
                 arm=np.array(self.arm),
                 joint_names=np.array(self.joint_names),
+                kinds=np.array(self.kinds),
                 **optional,
             )
         os.replace(partial, path)
@@ -123,7 +138,12 @@ def concatenate(first: Demonstrations, second: Demonstrations) -> Demonstrations
     is_kept = len(grippers) == 2 and first.gripper_names == second.gripper_names
     gripper = np.concatenate(grippers) if is_kept else None
     return dataclasses.replace(
-        first, **joined, torque=torque, gripper=gripper, gripper_names=first.gripper_names if is_kept else ()
+        first,
+        **joined,
+        torque=torque,
+        gripper=gripper,
+        gripper_names=first.gripper_names if is_kept else (),
+        kinds=first.kinds + second.kinds,
     )
 
 
@@ -171,7 +191,20 @@ def crossovers(demonstrations: Demonstrations, count: int, seed: int) -> Demonst
         "qvel": demonstrations.qvel.swapaxes(1, 2)[parents, joints].swapaxes(1, 2),
         "goals": demonstrations.goals[parents, joints],
     }
-    return dataclasses.replace(demonstrations, torque=None, gripper=None, gripper_names=(), **mixed)
+    return dataclasses.replace(demonstrations, torque=None, gripper=None, gripper_names=(), kinds=("crossover",) * count, **mixed)
+
+
+def effective_rank(demonstrations: Demonstrations) -> float:
+    """Number of independent courses of time in the motions, from 1 to T: the exponential of an entropy.
+
+    The courses are the right singular vectors of the joints' displacements over time [N n, T]; the entropy is that of
+    their fractions of the energy, the squared singular values (Roy and Vetterli, "The effective rank", 2007). Linear
+    feedback to one goal has about 1.
+    """
+    displacements = (demonstrations.qpos - demonstrations.qpos[:, :1])[:, 1:].swapaxes(1, 2)
+    values = np.linalg.svd(displacements.reshape(-1, demonstrations.horizon), compute_uv=False) ** 2
+    fractions = values[values > 0] / values.sum()
+    return float(np.exp(-np.sum(fractions * np.log(fractions))))
 
 
 def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
@@ -204,6 +237,11 @@ def _validated(content: dict[str, np.ndarray], name: str) -> Demonstrations:
             raise ValueError(f"demonstrations: {key} in {name!r} must be one value, got shape {content[key].shape}")
     if not np.issubdtype(content["seed"].dtype, np.integer):
         raise ValueError(f"demonstrations: seed in {name!r} must be an integer, got {content['seed'].dtype}")
+    if "kinds" in content and content["kinds"].shape != content["qpos"].shape[:1]:
+        raise ValueError(
+            f"demonstrations: kinds in {name!r} must have a name for each of {len(content['qpos'])} demonstrations, "
+            f"got shape {list(content['kinds'].shape)}"
+        )
     if content["dt"] <= 0:
         raise ValueError(f"demonstrations: dt in {name!r} must be one number above 0, got {content['dt']}")
     return Demonstrations(
@@ -217,6 +255,7 @@ def _validated(content: dict[str, np.ndarray], name: str) -> Demonstrations:
         torque=content.get("torque"),
         gripper=content.get("gripper"),
         gripper_names=tuple(map(str, np.atleast_1d(content.get("gripper_names", ())))),
+        kinds=tuple(map(str, content["kinds"])) if "kinds" in content else (),
     )
 
 

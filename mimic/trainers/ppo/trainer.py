@@ -14,7 +14,7 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.envs.make import make_env
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
-from mimic.evaluation.labels import SPLITS
+from mimic.evaluation.labels import ALL_KINDS, SPLITS
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
 from mimic.evaluation.rollout_metrics import MIN_SPAN
 from mimic.motions.demonstrations import Demonstrations, check_effort, concatenate, crossovers
@@ -69,9 +69,9 @@ class PPOTrainer(Trainer):
         self.total_steps = self.settings.total_steps
         env, held_out = run_environment(config.env, run_dir)
         if unseen is not None:
-            unseen.check_fits(env.expert, config.env.control_dt, config.env.horizon)
+            unseen.check_fits(env.expert, config.env.control_dt, unseen.horizon)
             check_effort(unseen, env.expert)
-            held_out = unseen.of_length(env.demonstrations.horizon)
+            env, held_out = env.with_horizon(unseen.horizon), unseen
         self.evaluator = Evaluator(env, held_out)
         mixed = with_crossovers(env.demonstrations, self.settings.crossovers, config.env.demonstrations.seed)
         self._env = env if mixed is env.demonstrations else env.with_demonstrations(mixed)
@@ -228,6 +228,7 @@ class PPOTrainer(Trainer):
             (label, _text(form, metrics[key]["train"]), _text(form, metrics[key]["held_out"]))
             for label, key, form in by_split
         ]
+        rows[1:1] = _rows_of_kinds(metrics["by_kind"])
         rows += [
             (
                 f"reward term {key.removeprefix('reward.')}",
@@ -262,6 +263,22 @@ class PPOTrainer(Trainer):
         )
         labels = plots.labels_of("demonstrations")
         plots.plot_training(folder, "optimality_gap", "optimality gap [%]", labels=labels, title=self._name)
+
+
+def _rows_of_kinds(by_kind: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[Row]:
+    """Rows of the gap of each kind of demonstrations, and of the interval of all."""
+
+    def cells(kind: str, text: Callable[[Mapping[str, float]], str]) -> Row:
+        train, held_out = (text(of[split]) if split in (of := by_kind[kind]) else "" for split in SPLITS)
+        return f"  {kind.replace('_', ' ')}", train, held_out
+
+    def interval(numbers: Mapping[str, float]) -> str:
+        return f"{100 * numbers['low']:.2f} to {100 * numbers['high']:.2f}%" if numbers["low"] == numbers["low"] else ""
+
+    rows = [("  95 % interval", *cells(ALL_KINDS, interval)[1:])]
+    if len(kinds := [kind for kind in by_kind if kind != ALL_KINDS]) > 1:
+        rows += [cells(kind, lambda numbers: _text("{:.2%}", numbers["optimality_gap"])) for kind in kinds]
+    return rows
 
 
 def _text(form: str, value: float) -> str:
