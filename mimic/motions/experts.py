@@ -20,13 +20,15 @@ GOAL_SHARE = 0.5  # goals lie within this fraction of the way from the home pose
 # Critically damped, at 2 rad/s. A goal that is pi/2 away needs a peak speed of 1.2 rad/s (omega * distance / e), within
 # every joint's velocity limit, and is reached to within 1 % in 3.3 s of the 5 s.
 GOAL_FREQUENCY = 2.0  # rad/s
-PID_FREQUENCY = 1.3  # rad/s: as much torque at the start as at `GOAL_FREQUENCY` without an integral
+_PID_INTEGRAL = 0.3  # rad/s, the slow pole of a PID controller, beside two at `GOAL_FREQUENCY`
 PATH_FREQUENCY = 4.0  # rad/s, of the feedback along a path
 REACH_FRACTION = 0.6  # fraction of an episode after which the expert has reached its goal and stays there
 _REACH_SPEED_FRACTION = 0.9  # of the velocity limit, for inverse kinematics; the feedback needs the rest
 _REACH_DAMPING = 1e-2  # regularises inverse kinematics near the stretched arm, a singularity where episodes start
 _STEP_TIME = 1.5, 3.0  # s, from one goal to the next
-_SPLINE_SPEED = 0.08, 0.5  # mean speed between two goals; quintic paths from rest to rest peak at 1.9 times that
+# Mean speed between two goals, of the velocity limit; a quintic path from rest to rest peaks at 1.9 times that.
+_SPLINE_SPEED = 0.08, 0.42
+_SPLINE_SHARE = 0.3, 0.75  # in place of `GOAL_SHARE`
 _SPLINE_TIME = 0.4  # s, at least, between two goals
 _HOLD_PROBABILITY, _HOLD_TIME = 0.2, (0.3, 1.0)  # of resting at a goal, and s
 
@@ -60,10 +62,10 @@ def make_expert(kind: str, arm: Arm, rng: np.random.Generator, horizon: int, dt:
     return _EXPERTS[kind](arm, rng, horizon, dt)
 
 
-def _random_goal(arm: Arm, rng: np.random.Generator) -> Float[np.ndarray, " joints"]:
+def _random_goal(arm: Arm, rng: np.random.Generator, share: float = GOAL_SHARE) -> Float[np.ndarray, " joints"]:
     home = np.asarray(arm.embodiment.home)
     lower, upper = np.asarray(arm.embodiment.joint_range).T
-    return home + GOAL_SHARE * (rng.uniform(lower, upper) - home)
+    return home + share * (rng.uniform(lower, upper) - home)
 
 
 def _computed_torque(arm: Arm, rng: np.random.Generator, horizon: int, dt: float) -> Expert:
@@ -80,20 +82,20 @@ def _to_goal(goal: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray
 def _pid(arm: Arm, rng: np.random.Generator, horizon: int, dt: float) -> Expert:
     """A PID controller for each joint, tuned for its effective inertia at home, without a model of the dynamics.
 
-    The gains give the joint alone, without damping, a triple pole at `PID_FREQUENCY`.
+    The gains are those that give the joint alone two poles at `GOAL_FREQUENCY` and a slow one.
     """
     del horizon
-    goal, frequency = _random_goal(arm, rng), PID_FREQUENCY
+    goal, fast, slow = _random_goal(arm, rng), GOAL_FREQUENCY, _PID_INTEGRAL
     home, damping = np.asarray(arm.embodiment.home), np.asarray(arm.model.dof_damping)
     # A joint's own damping is part of the derivative gain; where it is more than that, the joint moves more slowly.
-    inertia = np.maximum(effective_inertia(arm.model, home), damping / (3 * frequency))
+    inertia = np.maximum(effective_inertia(arm.model, home), damping / (2 * fast + slow))
     integral = np.zeros_like(home)
 
     def law(step: int, qpos: np.ndarray, qvel: np.ndarray, inverse: InverseDynamics) -> np.ndarray:
         del step, inverse
         error = goal - qpos
         integral[:] += error * dt
-        command = 3 * frequency**2 * error + frequency**3 * integral - 3 * frequency * qvel
+        command = (fast**2 + 2 * fast * slow) * error + fast**2 * slow * integral - (2 * fast + slow) * qvel
         return inertia * command + damping * qvel
 
     return Expert(law, goal)
@@ -115,12 +117,12 @@ def _steps(arm: Arm, rng: np.random.Generator, horizon: int, dt: float) -> Exper
 def _splines(arm: Arm, rng: np.random.Generator, horizon: int, dt: float) -> Expert:
     """Through several goals along quintic splines, with rests; joints move together or each in its own time."""
     times = np.arange(horizon + 2) * dt
-    speed = rng.uniform(*_SPLINE_SPEED) * finite_velocity_limit(arm.embodiment)
+    share, speed = rng.uniform(*_SPLINE_SHARE), rng.uniform(*_SPLINE_SPEED) * finite_velocity_limit(arm.embodiment)
     home, joints = np.asarray(arm.embodiment.home), np.arange(len(speed))
     groups = [joints] if rng.random() < 0.5 else list(joints[:, None])
     path, velocity = (np.empty((len(times), len(joints))) for _ in range(2))
     for group in groups:
-        spline = _spline(lambda group=group: _random_goal(arm, rng)[group], home[group], speed[group], times[-1], rng)
+        spline = _spline(lambda group=group: _random_goal(arm, rng, share)[group], home[group], speed[group], times[-1], rng)
         path[:, group], velocity[:, group] = spline(times), spline(times, 1)
     return Expert(_along(path, velocity, dt), path[-1])
 
