@@ -4,6 +4,7 @@ An expert is a law that gives the torques of a control step from the arm's state
 "splines" and "steps" know the arm's dynamics exactly; "pid" has no model of them.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -25,6 +26,7 @@ PATH_FREQUENCY = 4.0  # rad/s, of the feedback along a path
 REACH_FRACTION = 0.6  # fraction of an episode after which the expert has reached its goal and stays there
 _REACH_SPEED_FRACTION = 0.9  # of the velocity limit, for inverse kinematics; the feedback needs the rest
 _REACH_DAMPING = 1e-2  # regularises inverse kinematics near the stretched arm, a singularity where episodes start
+_REACH_SETTLING = 5  # steps at the goal, after which inverse kinematics no longer moves the arm
 _STEP_TIME = 1.5, 3.0  # s, from one goal to the next
 # Mean speed between two goals, of the velocity limit; a quintic path from rest to rest peaks at 1.9 times that.
 _SPLINE_SPEED = 0.08, 0.42
@@ -182,11 +184,14 @@ def _reach_path(
     end = mink.Configuration(model, goal).get_transform_frame_to_world(hand, "body")
     task = mink.FrameTask(hand, "body", position_cost=1.0, orientation_cost=0.3)  # 0.3 m/rad: the reach of a hand
     path, path_velocity = [configuration.q.copy()], []
+    moving = math.ceil(REACH_FRACTION * horizon)
     for step in range(horizon):
         progress = min((step + 1) / (REACH_FRACTION * horizon), 1.0)
-        task.set_target(start.interpolate(end, alpha=10 * progress**3 - 15 * progress**4 + 6 * progress**5))
-        velocity = mink.solve_ik(configuration, [task], dt, solver="daqp", damping=_REACH_DAMPING, limits=limits)
-        configuration.integrate_inplace(velocity, dt)
+        velocity = np.zeros_like(goal)
+        if step < moving + _REACH_SETTLING:  # the rest is at the goal
+            task.set_target(start.interpolate(end, alpha=10 * progress**3 - 15 * progress**4 + 6 * progress**5))
+            velocity = mink.solve_ik(configuration, [task], dt, solver="daqp", damping=_REACH_DAMPING, limits=limits)
+            configuration.integrate_inplace(velocity, dt)
         path.append(configuration.q.copy())
         path_velocity.append(velocity)
     return np.stack(path), np.stack([*path_velocity, np.zeros_like(goal)])
