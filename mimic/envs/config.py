@@ -43,7 +43,7 @@ class DemonstrationConfig:
     source: str = ""
     kind: str = MIXED
     # A core records some hundred in a second.
-    count: int = number(500, at_least=1, at_most=100_000)
+    count: int = number(600, at_least=1, at_most=100_000)
     held_out: int = number(80, at_least=1, at_most=100_000)
     seed: int = number(0, at_least=0, at_most=2**63 - 1)
 

@@ -30,7 +30,6 @@ _REACH_SETTLING = 5  # steps at the goal, after which inverse kinematics no long
 _STEP_TIME = 1.5, 3.0  # s, from one goal to the next
 # Mean speed between two goals, of the velocity limit; a quintic path from rest to rest peaks at 1.9 times that.
 _SPLINE_SPEED = 0.08, 0.42
-_SPLINE_SHARE = 0.3, 0.75  # in place of `GOAL_SHARE`
 _SPLINE_TIME = 0.4  # s, at least, between two goals
 _HOLD_PROBABILITY, _HOLD_TIME = 0.2, (0.3, 1.0)  # of resting at a goal, and s
 
@@ -64,10 +63,10 @@ def make_expert(kind: str, arm: Arm, rng: np.random.Generator, horizon: int, dt:
     return _EXPERTS[kind](arm, rng, horizon, dt)
 
 
-def _random_goal(arm: Arm, rng: np.random.Generator, share: float = GOAL_SHARE) -> Float[np.ndarray, " joints"]:
+def _random_goal(arm: Arm, rng: np.random.Generator) -> Float[np.ndarray, " joints"]:
     home = np.asarray(arm.embodiment.home)
     lower, upper = np.asarray(arm.embodiment.joint_range).T
-    return home + share * (rng.uniform(lower, upper) - home)
+    return home + GOAL_SHARE * (rng.uniform(lower, upper) - home)
 
 
 def _computed_torque(arm: Arm, rng: np.random.Generator, horizon: int, dt: float) -> Expert:
@@ -119,12 +118,12 @@ def _steps(arm: Arm, rng: np.random.Generator, horizon: int, dt: float) -> Exper
 def _splines(arm: Arm, rng: np.random.Generator, horizon: int, dt: float) -> Expert:
     """Through several goals along quintic splines, with rests; joints move together or each in its own time."""
     times = np.arange(horizon + 2) * dt
-    share, speed = rng.uniform(*_SPLINE_SHARE), rng.uniform(*_SPLINE_SPEED) * finite_velocity_limit(arm.embodiment)
+    speed = rng.uniform(*_SPLINE_SPEED) * finite_velocity_limit(arm.embodiment)
     home, joints = np.asarray(arm.embodiment.home), np.arange(len(speed))
     groups = [joints] if rng.random() < 0.5 else list(joints[:, None])
     path, velocity = (np.empty((len(times), len(joints))) for _ in range(2))
     for group in groups:
-        spline = _spline(lambda group=group: _random_goal(arm, rng, share)[group], home[group], speed[group], times[-1], rng)
+        spline = _spline(lambda group=group: _random_goal(arm, rng)[group], home[group], speed[group], times[-1], rng)
         path[:, group], velocity[:, group] = spline(times), spline(times, 1)
     return Expert(_along(path, velocity, dt), path[-1])
 

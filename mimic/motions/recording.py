@@ -84,9 +84,8 @@ def record_demonstrations(
             on_recorded(redrawn)
     qpos, qvel, torque, goals = (np.stack(column) for column in zip(*recordings, strict=True))
     embodiment = arm.embodiment
-    return Demonstrations(
-        qpos, qvel, goals, float(dt), embodiment.name, embodiment.joint_names, seed, torque, tuple(kinds)
-    )
+    names = embodiment.name, embodiment.joint_names
+    return Demonstrations(qpos, qvel, goals, float(dt), *names, seed, torque, kinds=tuple(kinds))
 
 
 def _recording(
