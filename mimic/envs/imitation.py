@@ -88,7 +88,6 @@ class ImitationEnv(Env):
         self._home_states = link_state_table(self.learner, home, np.zeros_like(home))
         self.config = config
         self._set_physics(choose_physics(config.physics, self.arm.model))
-        self.late_starts = 0.0
         self.held_out: Demonstrations | None = None
         if demonstrations is None:
             demonstrations, self.held_out = training_and_held_out(config, arms.expert)
@@ -98,15 +97,6 @@ class ImitationEnv(Env):
         """The same environment on other demonstrations."""
         env = copy.copy(self)
         env._set_demonstrations(demonstrations)
-        return env
-
-    def with_late_starts(self, fraction: float) -> "ImitationEnv":
-        """The same environment whose `restart_done` starts a fraction of the episodes at a random step.
-
-        The learner still starts at rest in its start pose, far from the expert: so it learns to catch up.
-        """
-        env = copy.copy(self)
-        env.late_starts = fraction
         return env
 
     def with_horizon(self, horizon: int) -> "ImitationEnv":
@@ -257,7 +247,7 @@ class ImitationEnv(Env):
     def restart_done(self, states: State) -> State:
         """Starts a new episode, on a random demonstration, for each arm of a batch whose episode is done."""
         arms = arm_state(states)
-        new = jax.vmap(lambda key: self.begin(self._restart(key)))(arms.key)
+        new = jax.vmap(self.reset)(arms.key)
         done = states.done.astype(bool)
 
         def where_done(new: Array, old: Array) -> Array:
@@ -265,15 +255,6 @@ class ImitationEnv(Env):
 
         arms, obs = jax.tree.map(where_done, (new.pipeline_state, new.obs), (arms, states.obs))
         return states.replace(pipeline_state=arms, obs=obs)
-
-    def _restart(self, key: Array) -> ArmState:
-        """The first state of an episode of a training, see `with_late_starts`."""
-        state = self.start(key)
-        if not self.late_starts:
-            return state
-        key_late, key_step = jax.random.split(jax.random.fold_in(state.key, FIRST_STEP))
-        is_late = jax.random.uniform(key_late) < self.late_starts
-        return self.at_step(state, jnp.where(is_late, jax.random.randint(key_step, (), 0, self.config.horizon), 0))
 
     def distance(
         self, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"], demonstration: Array, step: Array

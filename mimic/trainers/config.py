@@ -97,8 +97,6 @@ class PPOConfig(TrainerConfig):
       hidden_layers: widths of the hidden layers of the policy and value networks; with network "joints" of the latter.
       crossovers: number of additional training demonstrations, mixed joint by joint from the recorded ones, see
         `crossovers` in mimic/motions/demonstrations.py.
-      late_starts: fraction of the training episodes that start at a random step of their demonstration, so that the
-        learner, in its start pose, has to catch up; the report is of whole episodes.
       timed_critic: whether the value network also observes the elapsed fraction of the episode, on which the return
         depends. The policy never observes it.
       target_gap: training ends early when the optimality gap on the training demonstrations is at most this; 0 disables
@@ -131,7 +129,6 @@ class PPOConfig(TrainerConfig):
     network: FromPreset[str] = _unset()
     hidden_layers: FromPreset[list[int]] = number(None, at_least=1, at_most=2**16, entries=(1, 32))
     crossovers: FromPreset[int] = number(None, at_least=0, at_most=100_000)
-    late_starts: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
     timed_critic: bool = True
     target_gap: float = number(0.0, at_least=0.0, at_most=100.0)
     evaluations: FromPreset[int] = number(None, at_least=1, at_most=1_000_000)

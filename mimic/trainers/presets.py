@@ -21,7 +21,6 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
         "network": "mlp",
         "hidden_layers": [128, 128],
         "crossovers": 0,
-        "late_starts": 0.0,
         "evaluations": 10,
     },
     # One GPU: enough environments to keep it busy. The high entropy cost makes the arm explore other pose branches.
@@ -40,7 +39,6 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
         "network": "mlp",
         "hidden_layers": [512, 256],
         "crossovers": 8000,
-        "late_starts": 0.0,
         "evaluations": 8,
     },
 }

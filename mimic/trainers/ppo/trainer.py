@@ -74,8 +74,7 @@ class PPOTrainer(Trainer):
             env, held_out = env.with_horizon(unseen.horizon), unseen
         self.evaluator = Evaluator(env, held_out)
         mixed = with_crossovers(env.demonstrations, self.settings.crossovers, config.env.demonstrations.seed)
-        mixed_env = env if mixed is env.demonstrations else env.with_demonstrations(mixed)
-        self._env = mixed_env.with_late_starts(self.settings.late_starts)
+        self._env = env if mixed is env.demonstrations else env.with_demonstrations(mixed)
         self._demonstrations = concatenate(env.demonstrations, held_out)
         self.env_config = dataclasses.replace(config.env, physics=env.physics.name)
         self.headline = (
