@@ -24,7 +24,9 @@ from mimic.trainers.export.config import check_locked
 ROBOT_WORLDS = ("paper", "nominal", "hardware")
 ROBOTS = ("virtual_panda", "virtual_robot")
 ROBOT_LOOPS = ("mimic", "ruckig")
-CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "tracking")
+CONTROLLERS = (
+    "policy", "hold", "copy_joints", "pd", "computed_torque", "one_step", "nearest_pose", "tracking"
+)  # fmt: skip
 ROBOT_CONTROLLERS = ("policy", "tracking")
 ARM_SIDES = ("left", "right")
 DATASET_FORMATS = ("lerobot", "rosbag2")

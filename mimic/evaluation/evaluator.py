@@ -38,6 +38,7 @@ from mimic.runs.files import write_csv
 
 Controller = Callable[[State], Array]  # (state of the environment) -> action
 Motions = Float[np.ndarray, "demonstrations time joints"]
+_CHUNK = 256  # demonstrations whose bound is searched at a time
 EVALUATED_TRAINING = 80  # demonstrations for training that are evaluated, or as many as those held out
 
 
@@ -295,7 +296,13 @@ def _lower_bound(env: ImitationEnv, qpos: Motions, qvel: Motions) -> tuple[np.nd
         solution = closest_motion(env.expert, env.learner, qpos, qvel, **env.metric.arguments)
         return solution.distance, solution.qpos
 
+    # Of many demonstrations in chunks of one size, the last one filled up: all at once, they need too much memory.
+    count = len(qpos)
+    size = min(count, _CHUNK)
+    padded = np.minimum(np.arange(-(-count // size) * size), count - 1).reshape(-1, size)
     # On the CPU, where the function compiles several times faster; it runs only once.
     with on_host():
-        distance, poses = jax.jit(jax.vmap(closest))(qpos.astype(np.float32), qvel.astype(np.float32))
-        return np.asarray(distance), np.asarray(poses)
+        search = jax.jit(jax.vmap(closest))
+        chunks = [search(qpos[rows].astype(np.float32), qvel[rows].astype(np.float32)) for rows in padded]
+        distance, poses = (np.concatenate([np.asarray(chunk[i]) for chunk in chunks])[:count] for i in range(2))
+        return distance, poses

@@ -20,9 +20,12 @@ from mimic.evaluation.nearest_pose_controller import nearest_pose_controller
 from mimic.physics import dynamics
 from mimic.physics.joint_numbers import joints_of_model
 from mimic.retargeting.motions import largest_jump, optimal_motions
+from mimic.retargeting.pose import shared_joints
 
 _FREQUENCIES = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0)  # candidates [rad/s]; a torque is constant for 0.1 s
 _LEADS = range(1, 14)  # candidates [ticks]; delays of the hardware world are up to 6
+
+_NEWTON_STEPS = 3  # of a torque towards a pose; the inertia changes little in a control step
 
 _Law = Callable[[Array, Array, Array], Array]  # (desired acceleration, qpos, qvel) -> torque
 
@@ -37,15 +40,18 @@ def run_controller(evaluator: Evaluator, name: str) -> tuple[Rollouts, dict[str,
     - "nearest_pose": inverse dynamics to one of the poses nearest to the expert's at the next step, which are followed
       from step to step. In contrast to the others it does not know the motion in advance, see
       `nearest_pose_controller`.
+    - "copy_joints": the same feedback as "computed_torque" along the expert's own angles of the joints that both have.
+    - "one_step": the torque that brings the arm to the pose of the kinematic bound at the end of each step, by exact
+      dynamics.
     - "tracking": targets of an inner loop along the poses of the kinematic bound, see `tracking_controller`.
 
-    "pd" and "computed_torque" are critically damped. Of several frequencies, and of several leads of "tracking", the
+    "pd", "computed_torque" and "copy_joints" are critically damped. Of several frequencies, and of several leads of "tracking", the
     one with the smallest distance on the training demonstrations is used.
 
     Args:
       evaluator: evaluator of the environment and its demonstrations.
-      name: "hold"; "pd", "computed_torque" or "nearest_pose" where actions are torques; "tracking" where they are other
-        targets of an inner loop.
+      name: "hold"; "tracking" where actions are targets of an inner loop other than torques; the others where they are
+        torques.
 
     Returns:
       Rollouts of the controller, and its setting as an entry of the report: `frequency_rad_s`, 0 for one that has none,
@@ -64,7 +70,11 @@ def run_controller(evaluator: Evaluator, name: str) -> tuple[Rollouts, dict[str,
     if name == "tracking":
         rollouts, lead = run_tracking(evaluator)
         return rollouts, {"lead_ticks": lead}
-    make_controller = _feedback(env, {"pd": _joint_law, "computed_torque": _inverse_dynamics_law}[name](env))
+    if name == "one_step":
+        one_step = one_step_controller(env, evaluator.nearest_poses)
+        return jax.jit(lambda: evaluator.rollout(one_step))(), {"frequency_rad_s": 0.0}
+    motions = copied_motions(env) if name == "copy_joints" else reference_motions(env)
+    make_controller = _feedback(env, (_joint_law if name == "pd" else _inverse_dynamics_law)(env), motions)
     rollouts, frequency = _best(evaluator, make_controller, _FREQUENCIES)
     return rollouts, {"frequency_rad_s": frequency}
 
@@ -102,6 +112,33 @@ def tracking_controller(
     return controller
 
 
+def one_step_controller(env: ImitationEnv, poses: Motions) -> Controller:
+    """A controller that brings the arm to the next of the given poses within one control step, by exact dynamics.
+
+    It has no regard for the velocity there, nor for what follows.
+
+    Args:
+      env: the environment; its actions are torques.
+      poses: poses of the learner after each step [rad].
+    """
+    table, law, dt = jnp.asarray(poses, jnp.float32), _inverse_dynamics_law(env), env.config.control_dt
+
+    def controller(state: State) -> Array:
+        arm = arm_state(state)
+        target = table[arm.demonstration, jnp.minimum(arm.step, table.shape[1] - 1)]
+
+        def improve(acceleration: Array, _: None) -> tuple[Array, None]:
+            torque = jnp.clip(law(acceleration, arm.qpos, arm.qvel) / env.torque_scale, -1.0, 1.0)
+            after = arm_state(env.step(state, torque))
+            return acceleration + 2 / dt**2 * (target - after.qpos), None
+
+        acceleration = 2 / dt**2 * (target - arm.qpos - dt * arm.qvel)
+        acceleration, _ = jax.lax.scan(improve, acceleration, None, length=_NEWTON_STEPS)
+        return law(acceleration, arm.qpos, arm.qvel) / env.torque_scale
+
+    return controller
+
+
 def _best(
     evaluator: Evaluator, make: Callable[[Array], Controller], settings: Sequence[float]
 ) -> tuple[Rollouts, float]:
@@ -122,10 +159,19 @@ def reference_motions(
     return angles, np.gradient(angles, env.config.control_dt, axis=1)
 
 
-def _feedback(env: ImitationEnv, law: _Law) -> Callable[[Array], Controller]:
-    """A function from a frequency to a controller: feedback along the reference motion, and its acceleration."""
+def copied_motions(
+    env: ImitationEnv,
+) -> tuple[Float[np.ndarray, "demonstrations samples joints"], Float[np.ndarray, "demonstrations samples joints"]]:
+    """Angles and velocities of all demonstrations in the joints that both arms have; see `shared_joints`."""
+    motions = env.demonstrations
+    qpos, qvel = (shared_joints(env.expert, env.learner, x) for x in (motions.qpos, motions.qvel))
+    return qpos, qvel
+
+
+def _feedback(env: ImitationEnv, law: _Law, motions: tuple[np.ndarray, np.ndarray]) -> Callable[[Array], Controller]:
+    """A function from a frequency to a controller: feedback along the given motions, and their acceleration."""
     dt = env.config.control_dt
-    qpos, qvel = (jnp.asarray(x, jnp.float32) for x in reference_motions(env))
+    qpos, qvel = (jnp.asarray(x, jnp.float32) for x in motions)
 
     def make(frequency: Array) -> Controller:
         def controller(state: State) -> Array:
