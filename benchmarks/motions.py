@@ -1,0 +1,190 @@
+"""Gaps of policies, and of controllers without learning, on motions that no training has seen, kind by kind.
+
+    python -m benchmarks.motions --out FILE --runs RUN [RUN ...] [--sets test new long] [--controllers NAME ...]
+
+RUN is a run directory of `python -m mimic.train`; runs that differ in nothing but their seed are one policy.
+
+- test: the test set of the runs' environment, `--count` motions of each kind.
+- new: kinds that no training has. "circle": the hand draws a circle. "figure_eight": two joints move as sines of one
+  and of two periods. "backwards": splines played backwards. "person": `--person FILE`, demonstrations of the runs'
+  expert, from `python -m mimic.retarget`. The learner starts in the pose nearest to the first one of each.
+- long: 30 s of splines and of steps; the gap in the first and in the last 5 s.
+
+The interval is a 95 % hierarchical bootstrap over seeds and demonstrations. Centre line and hand are measures of
+similarity that nothing optimises, in chain lengths: means over all motions of a set, of the first seed.
+"""
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import mink
+import numpy as np
+
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import Row, collect
+from mimic.arms.arm import Arm
+from mimic.base.compilation import use_compilation_cache
+from mimic.base.config import to_dict
+from mimic.envs.imitation import recorded_demonstrations, test_demonstrations
+from mimic.evaluation.rollout_metrics import gap_interval, gaps
+from mimic.motions.demonstrations import Demonstrations, load_demonstrations
+from mimic.motions.experts import KINDS
+from mimic.runs.checkpoints import load_checkpoint
+from mimic.trainers.config import TrainConfig
+from mimic.trainers.make import make_ppo_trainer
+from mimic.trainers.ppo.trainer import PPOTrainer
+from mimic.trainers.run_config import load_config
+
+SETS = "test", "new", "long"
+CONTROLLERS = "copy_joints", "pd", "computed_torque", "one_step", "nearest_pose"
+COLUMNS = "env set kind controller gap:.2% low:.2% high:.2% seeds demonstrations centre_line:.4f hand:.3f"
+LONG, WINDOW = 300, 50  # steps
+RADIUS, PERIOD = 0.08, 4.0  # m and s, of the circle
+AMPLITUDE = 0.4  # rad, of the figure of eight
+
+
+def circles(arm: Arm, count: int, horizon: int, dt: float) -> Demonstrations:
+    """Demonstrations whose hand draws a circle around a random axis, one a period after a rest."""
+    model, embodiment = arm.model, arm.embodiment
+    task = mink.FrameTask(model.nbody - 1, "body", position_cost=1.0, orientation_cost=0.1)
+    posture = mink.PostureTask(model, 1e-3)
+    motions = []
+    for index in range(count):
+        rng = np.random.default_rng([7, index])
+        lower, upper = np.asarray(embodiment.joint_range).T
+        start = np.asarray(embodiment.home) + rng.uniform(0.25, 0.45, len(lower)) * (
+            rng.choice([lower, upper]) - np.asarray(embodiment.home)
+        )
+        configuration = mink.Configuration(model, start)
+        frame = configuration.get_transform_frame_to_world(model.nbody - 1, "body")
+        axes, posture_target = np.linalg.qr(rng.normal(size=(3, 3)))[0], start
+        posture.set_target(posture_target)
+        path = [start]
+        for step in range(1, horizon + 1):
+            time = step * dt
+            angle = 2 * np.pi * (time / PERIOD) * min(1.0, time / 1.0)  # from rest
+            offset = RADIUS * (axes[0] * (np.cos(angle) - 1) + axes[1] * np.sin(angle))
+            task.set_target(mink.SE3.from_rotation_and_translation(frame.rotation(), frame.translation() + offset))
+            for _ in range(3):
+                velocity = mink.solve_ik(configuration, [task, posture], dt, solver="daqp", damping=1e-4)
+                configuration.integrate_inplace(velocity, dt)
+            path.append(configuration.q.copy())
+        motions.append(path)
+    return _from_paths(arm, np.array(motions), dt, "circle")
+
+
+def figures_of_eight(arm: Arm, count: int, horizon: int, dt: float) -> Demonstrations:
+    """Demonstrations in which two joints move as sines of one and of two periods from the home pose."""
+    time = np.arange(horizon + 1) * dt
+    home, joints = np.asarray(arm.embodiment.home), arm.embodiment.num_joints
+    motions = np.tile(home, (count, horizon + 1, 1))
+    for index in range(count):
+        rng = np.random.default_rng([8, index])
+        first, second = rng.choice(joints, 2, replace=False)
+        phase = 2 * np.pi * time / rng.uniform(3.0, 5.0)
+        ramp = 1 - np.exp(-((time / 0.8) ** 2))
+        motions[index, :, first] += AMPLITUDE * ramp * np.sin(phase)
+        motions[index, :, second] += AMPLITUDE * ramp * np.sin(2 * phase) / 2
+    return _from_paths(arm, motions, dt, "figure_eight")
+
+
+def backwards(demonstrations: Demonstrations) -> Demonstrations:
+    """The same motions, played backwards."""
+    qpos, qvel = demonstrations.qpos[:, ::-1], -demonstrations.qvel[:, ::-1]
+    kinds = ("backwards",) * demonstrations.count
+    return dataclasses.replace(demonstrations, qpos=qpos, qvel=qvel, torque=None, kinds=kinds)
+
+
+def _from_paths(arm: Arm, qpos: np.ndarray, dt: float, kind: str) -> Demonstrations:
+    names = arm.embodiment.name, arm.embodiment.joint_names
+    qvel = np.gradient(qpos, dt, axis=1)
+    return Demonstrations(qpos, qvel, qpos[:, -1], dt, *names, kinds=(kind,) * len(qpos))
+
+
+def motions(name: str, config: TrainConfig, count: int, person: Path | None) -> Iterator[tuple[str, Demonstrations]]:
+    """The sets of motions, each with where the learner starts them."""
+    env, expert = config.env, config.env.build_arms().expert
+    if name == "test":
+        yield "home", test_demonstrations(env).select(slice(0, count * len(KINDS)))
+    elif name == "long":
+        for kind in ("splines", "steps"):
+            yield "home", recorded_demonstrations(
+                dataclasses.replace(env, horizon=LONG), expert, max(1, count // 8), kind=kind, test=True
+            )
+    else:
+        few, horizon, dt = max(1, count // 4), env.horizon, env.control_dt
+        yield "nearest", backwards(recorded_demonstrations(env, expert, few, kind="splines", test=True))
+        yield "nearest", circles(expert, few, horizon, dt)
+        yield "nearest", figures_of_eight(expert, few, horizon, dt)
+        if person is not None:
+            loaded = load_demonstrations(person)
+            yield "nearest", dataclasses.replace(loaded, kinds=("person",) * loaded.count)
+
+
+def rows(name: str, start: str, unseen: Demonstrations, policies: list[tuple[Path, TrainConfig]],
+         controllers: list[str]) -> Iterator[Row]:  # fmt: skip
+    """Rows of the policy of several seeds, and of each controller, on a set of motions."""
+    run, config = policies[0]
+    config = dataclasses.replace(config, env=dataclasses.replace(config.env, start=start))
+    trainer = make_ppo_trainer(config, run, unseen, None)
+    evaluator = trainer.evaluator
+    part = evaluator.parts["held_out"]
+    kinds = np.array(evaluator.env.demonstrations.kinds)[part]
+    windows = {"": slice(None)}
+    if name == "long":
+        windows = {", first 5 s": slice(0, WINDOW), ", last 5 s": slice(-WINDOW, None)}
+    for controller in ("policy", *controllers):
+        seeds = policies if controller == "policy" else policies[:1]
+        outcomes = [trainer.run_controller(controller, _params(trainer, path))[0] for path, _ in seeds]
+        similarity = {key: float(x[part].mean()) for key, x in evaluator.similarity(outcomes[0].qpos).items()}
+        distance = np.stack([np.asarray(outcome.distance)[part] for outcome in outcomes]).astype(float)
+        bound, hold = evaluator.lower_bound[part].astype(float), evaluator.hold_distance[part].astype(float)
+        for label, window in windows.items():
+            for kind in dict.fromkeys(kinds.tolist()):
+                of_kind = kinds == kind
+                means = (x[..., of_kind, window].mean(axis=-1) for x in (distance, bound, hold))
+                gap, low, high = gap_interval(*means)
+                yield {
+                    "env": config.env.name, "set": name, "kind": f"{kind}{label}", "controller": controller,
+                    "gap": gap, "low": low, "high": high, "seeds": len(seeds), "demonstrations": int(of_kind.sum()),
+                    "largest": float(np.nanmax(_gaps(distance, bound, hold)[:, of_kind])),
+                    "centre_line": similarity["centre_line_distance"], "hand": similarity["hand_position_error"],
+                }  # fmt: skip
+
+
+def _gaps(distance: np.ndarray, bound: np.ndarray, hold: np.ndarray) -> np.ndarray:
+    """Gap of each motion [seeds, demonstrations]; NaN where holding the start pose is at the bound."""
+    return gaps(distance.mean(axis=-1), bound.mean(axis=-1), hold.mean(axis=-1))
+
+
+def _params(trainer: PPOTrainer, run: Path) -> object:
+    return load_checkpoint(run, trainer.params_template(), None)[1]
+
+
+def _key(config: TrainConfig) -> str:
+    return json.dumps(to_dict(dataclasses.replace(config, seed=0, run_dir="")), sort_keys=True, default=str)
+
+
+def main() -> None:
+    parser = make_parser("motions", __doc__, sets=SETS, controllers=CONTROLLERS, count=640, person=Path)
+    parser.add_argument("--runs", nargs="+", type=Path, required=True, metavar="RUN")
+    options = parser.parse_args()
+    use_compilation_cache("~/.cache/mimic/jax")
+    groups: dict[str, list[tuple[Path, TrainConfig]]] = {}
+    for run in options.runs:
+        config = load_config(run)
+        groups.setdefault(_key(config), []).append((run, config))
+
+    def measured() -> Iterator[Row]:
+        for policies in groups.values():
+            for name in options.sets:
+                for start, unseen in motions(name, policies[0][1], options.count, options.person):
+                    yield from rows(name, start, unseen, policies, options.controllers)
+
+    collect(options, measured(), "rows", COLUMNS)
+
+
+if __name__ == "__main__":
+    main()
