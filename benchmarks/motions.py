@@ -110,8 +110,11 @@ def motions(name: str, config: TrainConfig, count: int, person: Path | None) -> 
         yield "home", test_demonstrations(env).select(slice(0, count * len(KINDS)))
     elif name == "long":
         for kind in ("splines", "steps"):
-            yield "home", recorded_demonstrations(
-                dataclasses.replace(env, horizon=LONG), expert, max(1, count // 8), kind=kind, test=True
+            yield (
+                "home",
+                recorded_demonstrations(
+                    dataclasses.replace(env, horizon=LONG), expert, max(1, count // 8), kind=kind, test=True
+                ),
             )
     else:
         few, horizon, dt = max(1, count // 4), env.horizon, env.control_dt

@@ -62,7 +62,7 @@ def expert_motions(config: ArmConfig, count: int, random: int) -> dict[str, Any]
     lower, upper = np.asarray(arm.embodiment.joint_range).T
     poses = np.random.default_rng(0).uniform(lower, upper, (random, 1, arm.embodiment.num_joints))
     motions: dict[str, Any] = {"random": poses}
-    for kind in ("pd", "reach"):
+    for kind in ("computed_torque", "reach"):
         try:
             motions[kind] = mimic.record_demonstrations(arm, count, kind=kind).qpos
         except ValueError as error:

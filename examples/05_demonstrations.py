@@ -25,13 +25,14 @@ out.mkdir(parents=True, exist_ok=True)
 
 # ---- Recording -------------------------------------------------------------------------------------------------------
 #
-# The expert is simulated in C MuJoCo and moves to random goals: by joint-space PD control ("pd", as in the paper), or
-# with the hand on a straight line by inverse kinematics ("reach"). Goals whose motions exceed a torque, velocity or
-# joint limit are resampled. A demonstration has 51 samples, 0.1 s apart, and the torque held in each interval.
+# The expert is simulated in C MuJoCo and moves to random goals: by a PID controller for each joint ("pid", as in the
+# paper), by exact inverse dynamics ("computed_torque"), with the hand on a straight line ("reach"), through several
+# goals ("splines") or to one that changes ("steps"). Goals whose motions exceed a torque, velocity or joint limit are
+# resampled. A demonstration has 51 samples, 0.1 s apart, and the torque held in each interval.
 
 panda = mimic.build_arm(mimic.ArmConfig())  # an embodiment, and a MuJoCo model to simulate it
 expert = panda.embodiment
-for kind in ("pd", "reach"):
+for kind in ("pid", "splines"):
     recorded = mimic.record_demonstrations(panda, 20, kind=kind, seed=0)
     assert recorded.torque is not None  # imported demonstrations have none, see below
     speed = np.abs(recorded.qvel).max(axis=(0, 1)) / expert.velocity_limit

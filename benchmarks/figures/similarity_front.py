@@ -15,7 +15,7 @@ FRONT = ("centre_line_distance", "tangent_angle_deg", "hand_position_error", "ha
 SLACK = {"hand_position_error": 1.05}  # multiple of the baseline's value that is no loss; 1 for the others
 # Below these a baseline is exact (a locked last roll joint moves no link): no ratio, and reaching them is no loss.
 EXACT = {name: 0.1 if name.endswith("deg") else 1e-3 for name in MEASURES}
-DEMONSTRATIONS = "pd", "reach"
+DEMONSTRATIONS = "computed_torque", "reach"
 
 
 def to_lines(rows: Sequence[Row]) -> list[str]:
@@ -103,5 +103,7 @@ def plot(rows: Sequence[Row], path: Path) -> None:
         axes.set(xlim=(0, 1.5), ylim=(0, 1.5), xlabel=f"{names[0]}, relative to copying", ylabel=names[1])
         axes.grid(alpha=0.25)
     panels[0].legend(fontsize=8)
-    figure.suptitle("28 locked Pandas, pd and reach; numbers: translation weight; filled: Pareto front", fontsize=10)
+    figure.suptitle(
+        "28 locked Pandas, computed torque and reach; numbers: translation weight; filled: Pareto front", fontsize=10
+    )
     save(figure, path)

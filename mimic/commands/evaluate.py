@@ -25,7 +25,13 @@ from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.trainer import Trainer
 
 CONTROLLERS_OF_MANY = ("policy", "nearest_pose")
-TORQUE_CONTROLLERS = ("copy_joints", "pd", "computed_torque", "one_step", "nearest_pose")  # for actions that are torques
+TORQUE_CONTROLLERS = (
+    "copy_joints",
+    "pd",
+    "computed_torque",
+    "one_step",
+    "nearest_pose",
+)  # for actions that are torques
 TARGET_CONTROLLERS = ("tracking",)  # for actions that are other targets of an inner loop
 
 

@@ -191,7 +191,9 @@ def crossovers(demonstrations: Demonstrations, count: int, seed: int) -> Demonst
         "qvel": demonstrations.qvel.swapaxes(1, 2)[parents, joints].swapaxes(1, 2),
         "goals": demonstrations.goals[parents, joints],
     }
-    return dataclasses.replace(demonstrations, torque=None, gripper=None, gripper_names=(), kinds=("crossover",) * count, **mixed)
+    return dataclasses.replace(
+        demonstrations, torque=None, gripper=None, gripper_names=(), kinds=("crossover",) * count, **mixed
+    )
 
 
 def effective_rank(demonstrations: Demonstrations) -> float:

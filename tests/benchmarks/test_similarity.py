@@ -31,7 +31,7 @@ def test_one_compiled_function_serves_all_weights():
         np.testing.assert_allclose(np.cos(poses), np.cos(best.qpos), atol=1e-3)  # float32, weights traced or constant
 
 
-def row(pair, method, values, kind="pd"):
+def row(pair, method, values, kind="computed_torque"):
     measures = {name: [value, 2 * value] for name, value in zip(MEASURES, values, strict=True)}
     return {"pair": pair, "set": kind, "method": method, "measures": measures}
 
@@ -52,16 +52,16 @@ LOCKS = [row for row in ROWS if summary.is_lock(row)]
 
 
 def test_lines_have_all_that_rows_have():
-    rows = [{**ROWS[0], "poses": 3}, {"pair": "a to panda", "set": "pd", "failed": "no goal"}]
+    rows = [{**ROWS[0], "poses": 3}, {"pair": "a to panda", "set": "computed_torque", "failed": "no goal"}]
     names, measured, failed = (line.split(";") for line in summary.to_lines(rows))
     line = dict(zip(names, measured, strict=True))
     assert (line["pair"], line["poses"], line["method"]) == ("panda -1", "3", "copy_joints")
     assert (line["frechet_distance"], line["frechet_distance q90"]) == ("0.2", "0.4")
-    assert failed == ["a to panda", "pd", "0", "no goal"]
+    assert failed == ["a to panda", "computed_torque", "0", "no goal"]
 
 
 def test_ratios_and_cases_lost():
-    compared = summary.compare(LOCKS, "copy_joints", ("pd",))
+    compared = summary.compare(LOCKS, "copy_joints", ("computed_torque",))
     assert list(compared) == ["copy_joints", "kept overlap 1", "kept overlap 2"]
     first, second = (compared[f"kept overlap {weight}"] for weight in (1, 2))
     assert first["cases"] == 2

@@ -14,7 +14,7 @@ from mimic.commands import cli
 from mimic.metric.config import MetricConfig
 from tests.helpers.run_directories import write_run
 
-UNSEEN = {f"{{{kind}}}": f"demonstrations={kind}.npz" for kind in ("pd", "reach")}
+UNSEEN = {f"{{{kind}}}": f"demonstrations={kind}.npz" for kind in ("computed_torque", "reach")}
 
 
 @pytest.fixture(scope="module")

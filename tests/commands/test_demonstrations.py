@@ -15,7 +15,7 @@ def panda():
     return mimic.build_arm(mimic.ArmConfig())
 
 
-@pytest.mark.parametrize("kind", ["pd", pytest.param("reach", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["computed_torque", pytest.param("mixed", marks=pytest.mark.slow)])
 def test_the_command_records_what_the_library_does(kind, tmp_path):
     out = tmp_path / "demonstrations.npz"
     printed = run("demonstrations", f"kind={kind}", "count=3", "seed=5", f"out={out}")
@@ -33,7 +33,10 @@ def test_the_command_records_what_the_library_does(kind, tmp_path):
         (["out={taken}"], "exists; name a new file"),
         (["out=new.txt"], "expected a file that ends in .npz"),
         (["out=new.npz", "plot=new.txt"], "expected a file that ends in .png, .pdf, .svg"),
-        (["out=new.npz", "kind=dance"], "expected one of pd, reach, got 'dance'"),
+        (
+            ["out=new.npz", "kind=dance"],
+            "expected one of computed_torque, pid, reach, splines, steps, mixed, got 'dance'",
+        ),
         (["out=new.npz", "count=0"], "count: expected a whole number from 1 to 100,000, got 0"),
         (["out=new.npz", "seed=-1"], "expected a whole number from 0 to 9,223,372,036,854,775,807, got -1"),
     ],

@@ -1,5 +1,6 @@
 """`python -m mimic.evaluate`: controllers on demonstrations, and what it rejects."""
 
+import collections
 import csv
 import dataclasses
 import json
@@ -11,8 +12,11 @@ import pytest
 
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
+from mimic.envs import imitation
+from mimic.envs.config import DemonstrationConfig
 from mimic.envs.imitation import training_and_held_out
 from mimic.evaluation import evaluator
+from mimic.motions.experts import KINDS
 from mimic.physics import step as physics
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.runs.signals import Signals
@@ -86,7 +90,7 @@ def test_a_policy_is_evaluated_on_mjx_too(run_dir, tmp_path, monkeypatch, capsys
 
 @pytest.mark.slow
 def test_other_demonstrations_replace_the_held_out_ones(run_dir, unseen, tmp_path):
-    """1e-5: float32, the same distances from another compiled function."""
+    """Episodes have their length. 1e-5: float32, the same distances from another compiled function."""
     unseen.of_length(HORIZON + 5).save(tmp_path / "unseen.npz")  # more steps than the run's demonstrations have
     overrides = {"demonstrations": str(tmp_path / "unseen.npz"), "physics": "fused"}
     plain, rows = evaluate(run_dir, tmp_path / "plain", **overrides)
@@ -98,6 +102,18 @@ def test_other_demonstrations_replace_the_held_out_ones(run_dir, unseen, tmp_pat
             assert float(row[key]) == pytest.approx(float(other[key]), rel=1e-5)
         assert float(row["mean_distance"]) != pytest.approx(float(other["mean_distance"]), rel=1e-3)
     assert plain["mean_distance"] != heavy["mean_distance"] and "mjx" not in plain
+    with (tmp_path / "plain" / "quality.csv").open(newline="") as file:
+        times = [float(row["time"]) for row in csv.DictReader(file) if row["split"] == "held_out"]
+    assert len(times) == HORIZON + 5
+
+
+def test_the_test_set_has_the_same_number_of_each_kind(monkeypatch):
+    monkeypatch.setattr(imitation, "TEST_COUNT", 1)
+    unseen = imitation.test_demonstrations(environment())
+    assert collections.Counter(unseen.kinds) == dict.fromkeys(KINDS, imitation.TEST_SETS)
+    given = dataclasses.replace(environment(), demonstrations=DemonstrationConfig(path="motions.npz"))
+    with pytest.raises(ValueError, match="split: expected none where the demonstrations are those of 'motions.npz'"):
+        imitation.test_demonstrations(given)
 
 
 def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
@@ -118,9 +134,12 @@ def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
     [
         (
             ["controller=mpc"],
-            "controller: expected one of policy, hold, pd, computed_torque, nearest_pose, tracking, got 'mpc'",
+            "controller: expected one of policy, hold, copy_joints, pd, computed_torque, one_step, nearest_pose, "
+            "tracking, got 'mpc'",
         ),
         (["physics=bullet"], "physics: expected one of mjx, fused, got 'bullet'"),
+        (["split=validation"], "split: expected one of test, got 'validation'"),
+        (["split=test", "demonstrations=x.npz"], "split, demonstrations, robot: expected one of them, got several"),
         (["checkpoint=7"], "has no checkpoint 7; it has 0"),
         (["mass=0"], "mass: expected a number from 0.001 to 1000, got 0.0"),
         (["torque_noise=-1"], "torque_noise: expected a number from 0 to 10, got -1"),

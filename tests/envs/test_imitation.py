@@ -187,7 +187,7 @@ def test_training_and_held_out_demonstrations_differ():
         ({"preview": "x"}, "could not be converted to Integer"),
         ({"demonstrations": {"cont": 1}}, "unknown key 'demonstrations.cont'"),
         ({"limits": "soft"}, "expected one of none, hardware"),
-        ({"demonstrations": {"kind": "dance"}}, "expected one of pd, reach"),
+        ({"demonstrations": {"kind": "dance"}}, "expected one of computed_torque, pid, reach, splines, steps, mixed"),
         ({"metric": {"rotation": -1.0}}, "metric.rotation: expected a number from 0 to 1e.06, got -1.0"),
         ({"learner": {"locked": [9]}}, "unknown joint 9"),
     ],

@@ -15,7 +15,7 @@ from mimic.envs.imitation import training_and_held_out
 from mimic.evaluation import evaluator as evaluation
 from mimic.evaluation import plots
 from mimic.evaluation.evaluator import Evaluator, Rollouts
-from mimic.evaluation.rollout_metrics import gaps, has_gap, measure
+from mimic.evaluation.rollout_metrics import gap_interval, gaps, has_gap, measure
 from mimic.evaluation.tracking_controllers import run_controller
 from mimic.metric.kinematics import link_state_table
 from mimic.trainers.ppo.trainer import PPOTrainer
@@ -226,6 +226,49 @@ def test_holding_the_start_pose_is_the_reference_of_the_gap(evaluator):
     ran, setting = run_controller(evaluator, "hold")
     np.testing.assert_allclose(ran.distance, evaluator.hold_distance, atol=1e-6)
     assert setting == {"frequency_rad_s": 0} and not np.asarray(ran.torque).any()
+
+
+def test_gaps_and_intervals_of_each_kind(evaluator):
+    """The same gap everywhere has an interval of no width; 1e-5: distances of a rollout are float32."""
+    gap = np.full(COUNT + HELD_OUT, 0.25)
+    by_kind = evaluator.summary(between(evaluator, gap))["by_kind"]
+    kinds = evaluator.env.demonstrations.kinds
+    assert list(by_kind) == [*dict.fromkeys(kinds), "all"]
+    for kind, splits in by_kind.items():
+        for split, part in SPLITS.items():
+            count = len(kinds[part]) if kind == "all" else kinds[part].count(kind)
+            assert (split in splits) == (count > 0)
+            if count:
+                assert splits[split] == pytest.approx(
+                    {"optimality_gap": 0.25, "low": 0.25, "high": 0.25, "demonstrations": count}, rel=1e-5
+                )
+
+
+def test_an_interval_covers_both_seeds_and_demonstrations():
+    """With two seeds of gaps 0 and 1 a quarter of the resamples has only the one or the other: 0 and 1 are the ends."""
+    bound, hold = np.zeros(50), np.ones(50)
+    gap, low, high = gap_interval(np.stack([bound, hold]), bound, hold)
+    assert (gap, low, high) == (0.5, 0.0, 1.0)
+    # Of one seed the interval is that of a mean: 1.96 standard errors, with 3 % of Monte Carlo error and skewness.
+    distance = np.random.default_rng(0).normal(0.5, 0.1, (1, 400))
+    gap, low, high = gap_interval(distance, np.zeros(400), np.ones(400))
+    assert gap == pytest.approx(distance.mean())
+    assert [low, high] == pytest.approx([gap - 0.0098, gap + 0.0098], abs=5e-4)
+    assert np.isnan(gap_interval(distance, np.ones(400), np.ones(400))).all()
+
+
+def test_controllers_that_know_the_dynamics_copy_an_equal_arm(evaluator):
+    """The bound is 0, and each torque of the expert can be found again; 1e-4: float32."""
+    copied, inverted = (run_controller(evaluator, name)[0] for name in ("copy_joints", "one_step"))
+    for split in SPLITS:
+        assert evaluator.summary(inverted)["optimality_gap"][split] < 1e-4
+        assert evaluator.summary(copied)["optimality_gap"][split] < 3e-3
+
+
+def test_another_horizon_repeats_the_last_sample(evaluator):
+    longer = evaluator.env.with_horizon(HORIZON + 3)
+    assert longer.config.horizon == HORIZON + 3
+    np.testing.assert_array_equal(longer.expert_states.position[:, -1], evaluator.env.expert_states.position[:, -1])
 
 
 @pytest.mark.slow

@@ -275,7 +275,8 @@ def _rows_of_kinds(by_kind: Mapping[str, Mapping[str, Mapping[str, float]]]) -> 
     def interval(numbers: Mapping[str, float]) -> str:
         return f"{100 * numbers['low']:.2f} to {100 * numbers['high']:.2f}%" if numbers["low"] == numbers["low"] else ""
 
-    rows = [("  95 % interval", *cells(ALL_KINDS, interval)[1:])]
+    intervals = cells(ALL_KINDS, interval)[1:]
+    rows = [("  95 % interval", *intervals)] if any(intervals) else []
     if len(kinds := [kind for kind in by_kind if kind != ALL_KINDS]) > 1:
         rows += [cells(kind, lambda numbers: _text("{:.2%}", numbers["optimality_gap"])) for kind in kinds]
     return rows
