@@ -32,7 +32,7 @@ TORQUE_CONTROLLERS = (
     "one_step",
     "nearest_pose",
 )  # for actions that are torques
-TARGET_CONTROLLERS = ("tracking",)  # for actions that are other targets of an inner loop
+TARGET_CONTROLLERS = ("tracking",)
 
 
 def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], None]:

@@ -223,8 +223,9 @@ class Evaluator:
             for split, part in self.parts.items():
                 distance, bound, hold = columns[:, part][:, (kinds[part] == kind) | (kind == ALL_KINDS)]
                 if len(distance):
-                    numbers = zip(("optimality_gap", "low", "high"), gap_interval(distance[None], bound, hold))
-                    result.setdefault(kind, {})[split] = {**dict(numbers), "demonstrations": len(distance)}
+                    gap, low, high = gap_interval(distance[None], bound, hold)
+                    numbers = {"optimality_gap": gap, "low": low, "high": high, "demonstrations": len(distance)}
+                    result.setdefault(kind, {})[split] = numbers
         return result
 
     def worst(self, rollouts: Rollouts) -> dict[str, dict[str, float]]:

@@ -45,8 +45,8 @@ def run_controller(evaluator: Evaluator, name: str) -> tuple[Rollouts, dict[str,
       dynamics.
     - "tracking": targets of an inner loop along the poses of the kinematic bound, see `tracking_controller`.
 
-    "pd", "computed_torque" and "copy_joints" are critically damped. Of several frequencies, and of several leads of "tracking", the
-    one with the smallest distance on the training demonstrations is used.
+    "pd", "computed_torque" and "copy_joints" are critically damped. Of several frequencies, and of several leads of
+    "tracking", the one with the smallest distance on the training demonstrations is used.
 
     Args:
       evaluator: evaluator of the environment and its demonstrations.

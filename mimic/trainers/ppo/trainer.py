@@ -276,7 +276,9 @@ def _rows_of_kinds(by_kind: Mapping[str, Mapping[str, Mapping[str, float]]]) -> 
         return f"{100 * numbers['low']:.2f} to {100 * numbers['high']:.2f}%" if numbers["low"] == numbers["low"] else ""
 
     intervals = cells(ALL_KINDS, interval)[1:]
-    rows = [("  95 % interval", *intervals)] if any(intervals) else []
+    if not any(intervals):
+        return []  # there is no gap
+    rows: list[Row] = [("  95 % interval", *intervals)]
     if len(kinds := [kind for kind in by_kind if kind != ALL_KINDS]) > 1:
         rows += [cells(kind, lambda numbers: _text("{:.2%}", numbers["optimality_gap"])) for kind in kinds]
     return rows
