@@ -14,6 +14,7 @@ from benchmarks.common.cells import (
     percent,
     span,
     split_pair,
+    where,
 )
 
 # Poses
@@ -110,6 +111,33 @@ def simulations(study: Results, preset: Results) -> list[Cells]:
     for name, joints, count, reports in cases:
         paper = study["results"][f"{name}-paper"][0]["optimality_gap"]
         rows.append((joints, count, gap(reports, "train"), gap(reports, "held_out"), split_pair(paper)))
+    return rows
+
+
+def kinds_of_motions(training: Results) -> list[Cells]:
+    """Gaps of each kind of validation motions by environment, the range over seeds."""
+    names = {env: f"{pair.split()[-1]} joints" for env, pair in ENVIRONMENTS.items()}
+    rows: list[Cells] = [("validation motions, gap [%]", *names.values())]
+    kinds = [kind for kind in training["rows"][0]["by_kind"] if kind != "all"]
+    for kind in [*kinds, "all"]:
+        by_env = ([row["by_kind"][kind]["held_out"] for row in where(training["rows"], env=env)] for env in names)
+        label = kind if kind == "all" else f"`{kind}`"
+        rows.append((label, *(span([numbers["optimality_gap"] for numbers in runs]) for runs in by_env)))
+    return rows
+
+
+def unseen_motions(motions: Results) -> list[Cells]:
+    """Gap of the policy and of controllers without learning on each set and kind of motions, by environment."""
+    names = ("policy", "copy_joints", "one_step", "nearest_pose", "computed_torque")
+    rows: list[Cells] = [("joints", "motions", "policy: gap, 95 % interval [%]", *(f"`{name}`" for name in names[1:]))]
+    keys = dict.fromkeys((row["env"], row["set"], row["kind"]) for row in motions["rows"])
+    for env, which, kind in keys:
+        found = where(motions["rows"], env=env, set=which, kind=kind)
+        gaps = {row["controller"]: row for row in found}
+        policy = gaps["policy"]
+        text = f"{100 * policy['gap']:.2f}, {100 * policy['low']:.2f} to {100 * policy['high']:.2f}"
+        others = (f"{100 * gaps[name]['gap']:.2f}" if name in gaps else "" for name in names[1:])
+        rows.append((ENVIRONMENTS[env].split()[-1], f"{which}: {kind.replace('_', ' ')}", text, *others))
     return rows
 
 

@@ -20,7 +20,7 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
         "final_entropy_cost": 1.0,
         "network": "mlp",
         "hidden_layers": [128, 128],
-        "crossovers": 0,
+        "crossovers": 4000,
         "evaluations": 10,
     },
     # One GPU: enough environments to keep it busy. The high entropy cost makes the arm explore other pose branches.
