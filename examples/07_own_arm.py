@@ -102,7 +102,7 @@ print(
 # 0 is the kinematic bound, 1 is holding the start pose. The policy imitates its eight training motions roughly, and
 # others hardly at all: that needs more demonstrations and more steps. A gap above 1 does not mean that the arm cannot
 # do better: an untrained policy moves at random, which is worse than holding the start pose. The command that `inspect`
-# printed trains on 124 demonstrations, for ten minutes or more on two cores.
+# printed trains on 600 demonstrations, for ten minutes or more on two cores.
 
 print(f"kinematic bound: {report['lower_bound']['held_out']:.3f}, "
       f"holding the start pose: {report['hold_distance']['held_out']:.3f}")  # fmt: skip
