@@ -4,6 +4,9 @@ The metric is a sum over pairs of links of a_tr |p - p_i| + a_rot (pi / 2) (1 - 
 by the joint angles follow from the axes of the joints in closed form. The Hessian is that of the quadratic function
 that touches the metric at the given pose and lies above it wherever the links move little: 1 / |p - p_i| becomes the
 curvature of a pair's translation, as in iteratively reweighted least squares.
+
+The Newton method of `imitate_pose` runs twice as fast, but its three steps from random poses end at a mean distance of
+0.211 instead of 0.188 (Pandas with locked joints), and a controller has no time for more.
 """
 
 from typing import NamedTuple

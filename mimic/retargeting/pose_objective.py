@@ -135,7 +135,9 @@ def _static(
     angles = None
     if metric.rotation == "angle":
         angles = _weighted_pairs(correspondence, weights.rotation) if chosen is None else chosen
-    directed = np.arange(correspondence.shape[1]) if angles is None else angles[:, 1]  # link of each direction's pull
+    directed = (
+        np.arange(np.shape(correspondence)[1]) if angles is None else angles[:, 1]
+    )  # link of each direction's pull
 
     def pulls_on_directions(direction: Array) -> tuple[Array, Array]:
         if angles is not None:
@@ -225,7 +227,7 @@ def _of_data(learner: ArmArrays, pairs: Any, directed: Any, rotation: RotationMe
                 for frame in frames
             ]
         )
-        points, units = (tuple(x[:, k, None] for k in range(3)) for x in (target.points, target.units))
+        points, units = ((x[:, 0, None], x[:, 1, None], x[:, 2, None]) for x in (target.points, target.units))
         positions = Pull([], [], [points], [target.weights[:, None]])
         directions = Pull([units], [target.strengths[:, None]], [], [])
 

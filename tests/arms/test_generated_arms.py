@@ -44,7 +44,7 @@ def test_inverse_dynamics(x64, batch):
     as_data = jax.jit(jax.vmap(torque_of_arm))(batch.arrays, batch.qpos, batch.qvel, batch.qacc)
     for arm, motion, torque in zip(batch.arms, batch.motions, np.asarray(as_data), strict=True):
         *state, expected = motion
-        constant = dynamics.inverse(joints_of_model(arm.model), *(x.tolist() for x in state), trigonometry)
+        constant = dynamics.inverse(joints_of_model(arm.model), *(x.tolist() for x in state), trigonometry=trigonometry)
         assert_equal(constant, expected)
         assert_equal(torque[: len(expected)], expected)
         assert not torque[len(expected) :].any()

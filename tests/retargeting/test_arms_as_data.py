@@ -1,5 +1,7 @@
 """Another arm as data compiles nothing, and gives what the embodiment gives."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -106,6 +108,7 @@ def test_what_only_embodiments_take_is_rejected(learners):
     expert, rows = learners
     with pytest.raises(ValueError, match="expected two embodiments or two arms as data, got one of each"):
         mimic.imitate_pose(mimic.panda(), rows[0][0], poses(0, 7), rows[0][2], WEIGHTS)
-    for changes in ({"costs": Costs(home=0.1)}, {"reduction": "frobenius"}):
+    cases: list[dict[str, Any]] = [{"costs": Costs(home=0.1)}, {"reduction": "frobenius"}]
+    for changes in cases:
         with pytest.raises(ValueError, match="expected a constant correspondence and weights"):
             imitated(expert, rows[0], poses(0, 7), **changes)
