@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -76,11 +76,8 @@ def export_run(
       ValueError: the run or the checkpoint does not exist, the file cannot be written, the format is unknown, or a
         package that it needs is not installed.
     """
-    config = ExportConfig(os.fspath(run), os.fspath(out), format, learner, list(locked), checkpoint)
-    if export := _folder_writer(config) or _description_writer(config):
-        export()
-    else:
-        _write(exported_function(config), _file(config), format)
+    write, _ = _writer(ExportConfig(os.fspath(run), os.fspath(out), format, learner, list(locked), checkpoint))
+    write()
     return Path(out).expanduser()
 
 
@@ -90,37 +87,36 @@ def prepare_export(config: ExportConfig) -> Callable[[], None]:
     Raises:
       ValueError: see `export_run`.
     """
-    if export := _folder_writer(config) or _description_writer(config):
-        return export
-    out = _file(config)
-    exported = exported_function(config)
+    write, summary = _writer(config)
 
     def run() -> None:
-        _write(exported, out, config.format)
+        write()
         console = Console()
-        title = f"{exported.kind.replace('_', ' ')} of {exported.metadata['env']}"
-        inputs = ", ".join(f"{name} [batch, {size}]" for name, size in exported.inputs.items())
-        outputs = ", ".join(exported.metadata["outputs"])
-        console.print(f"{title}: {inputs} -> {outputs}", markup=False)
-        console.print(f"results: {out}", soft_wrap=True, highlight=False)
+        if summary:
+            console.print(summary, markup=False)
+        console.print(f"results: {Path(config.out).expanduser()}", soft_wrap=True, highlight=False)
 
     return run
 
 
-def _folder_writer(config: ExportConfig) -> Callable[[], None] | None:
-    """Writes the controller of a run; None for another format."""
-    if config.format != CONTROLLER:
-        return None
-    _check_package(config.format)
-    out, run_dir = new_folder("out", config.out), _run_dir(config)
-    write = prepare_controller(run_dir, config.checkpoint)
-    _check_no_learner(config)
-
-    def run() -> None:
-        write(out)
-        Console().print(f"results: {out}", soft_wrap=True, highlight=False)
-
-    return run
+def _writer(config: ExportConfig) -> tuple[Callable[[], None], str]:
+    """Writes the controller of a run, its network, or the description of an arm; and the inputs and outputs as text."""
+    if config.format == CONTROLLER:
+        _check_package(config.format)
+        out = new_folder("out", config.out)
+        write = prepare_controller(_run_dir(config), config.checkpoint)
+        _check_no_learner(config)
+        return lambda: write(out), ""
+    if config.learner and config.run:
+        trained = load_config(_run_dir(config))
+        if trained.env.kind == "sampled_arms":
+            check_checkpoint(_run_dir(config), config.checkpoint)
+            return _description_writer(trained, config), ""
+    out, exported = _file(config), exported_function(config)
+    inputs = ", ".join(f"{name} [batch, {size}]" for name, size in exported.inputs.items())
+    title = f"{exported.kind.replace('_', ' ')} of {exported.metadata['env']}"
+    summary = f"{title}: {inputs} -> {', '.join(exported.metadata['outputs'])}"
+    return lambda: _write(exported, out, config.format), summary
 
 
 def _run_dir(config: ExportConfig) -> Path:
@@ -166,34 +162,16 @@ def exported_function(config: ExportConfig) -> ExportedFunction:
     return make_function(trained, run_dir, steps)
 
 
-def _description_writer(config: ExportConfig) -> Callable[[], None] | None:
-    """Writes the description of the arm `learner` for a run whose learner is any arm; None for another export."""
-    run_dir = Path(config.run).expanduser()
-    if not config.learner or not config.run:
-        return None
-    trained = load_config(run_dir)
-    if trained.env.kind != "sampled_arms":
-        return None
-    check_checkpoint(run_dir, config.checkpoint)
-    return _write_description(trained, config.learner, config.locked, config.out)
-
-
-def _write_description(trained: TrainConfig, learner: str, locked: Sequence[Any], out: str) -> Callable[[], None]:
+def _description_writer(trained: TrainConfig, config: ExportConfig) -> Callable[[], None]:
     """Writes the description of an arm for the exported function of a run whose learner is any arm.
-
-    Args:
-      trained: config of the run.
-      learner: the arm.
-      locked: its locked joints, by number or name.
-      out: file to write.
 
     Raises:
       ValueError: another suffix than that of descriptions, no such arm, or one that the run's function does not take.
     """
-    file = new_file("out", out)
+    file, learner, locked = new_file("out", config.out), config.learner, config.locked
     if file.suffix != SUFFIX:
         raise ValueError(
-            f"out: expected a file {SUFFIX} for the description of learner={learner}, got {out!r}; "
+            f"out: expected a file {SUFFIX} for the description of learner={learner}, got {config.out!r}; "
             "export the network, which takes any arm, without learner="
         )
     is_policy = trained.trainer.name == "ppo"
@@ -208,12 +186,8 @@ def _write_description(trained: TrainConfig, learner: str, locked: Sequence[Any]
         max_torque = torque_scale(jax.tree.map(jnp.asarray, arrays), env.action_scale, env.control_dt)
         arrays = dataclasses.replace(arrays, torque_limit=np.asarray(max_torque))
 
-    def run() -> None:
-        name = described.embodiment.name
-        save_description(file, arrays, name, described.slots, has_dynamics=is_policy)
-        Console().print(f"results: {file}", soft_wrap=True, highlight=False)
-
-    return run
+    name = described.embodiment.name
+    return lambda: save_description(file, arrays, name, described.slots, has_dynamics=is_policy)
 
 
 def _check_no_learner(config: ExportConfig) -> None:
