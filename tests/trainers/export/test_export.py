@@ -153,14 +153,12 @@ def test_an_onnx_mapper_to_any_arm_equals_the_mapper(tmp_path, expert):
     mapper = any_arm_run(tmp_path / "run", expert)
     session = session_of(mimic.export_run(tmp_path / "run", tmp_path / "mapper.onnx"))
     poses = random_poses(mapper.expert, 50)
-    json_file, npz_file = tmp_path / "panda.json", tmp_path / "panda4dof.npz"
-    mimic.export_run(tmp_path / "run", json_file, learner="panda")
-    mimic.export_run(tmp_path / "run", npz_file, learner="panda4dof")
-    arms = {
-        "panda": json.loads(json_file.read_text())["learner"],
-        "panda4dof": np.load(npz_file)["learner"],
-        "random": description(jax.device_get(random_arm(jax.random.PRNGKey(1)))),
-    }
+    files = {name: tmp_path / f"{name}.json" for name in ("panda", "panda4dof")}
+    for name, file in files.items():
+        mimic.export_run(tmp_path / "run", file, learner=name)
+    written = {name: json.loads(file.read_text()) for name, file in files.items()}
+    arms = {name: content["learner"] for name, content in written.items()}
+    arms["random"] = description(jax.device_get(random_arm(jax.random.PRNGKey(1))))
     for (name, vector), joints in zip(arms.items(), (7, 4, 7), strict=True):
         learner = np.asarray(vector, np.float32)
         inputs = [{"expert_qpos": pose[None], "learner": learner[None]} for pose in poses]
@@ -175,7 +173,7 @@ def test_an_onnx_mapper_to_any_arm_equals_the_mapper(tmp_path, expert):
     metadata = session.get_modelmeta().custom_metadata_map
     layout = json.loads(metadata["learner_layout"])
     assert layout[-1]["stop"] == len(arms["panda"]) and json.loads(metadata["expert_joints"])[0] == "joint1"
-    assert json.loads(json_file.read_text())["joints"] == [f"joint{i}" for i in range(1, 8)]
+    assert written["panda"]["joints"] == [f"joint{i}" for i in range(1, 8)]
 
 
 @pytest.mark.slow
