@@ -129,7 +129,7 @@ def _static(
 
     For the cosines the expert reduces to one pull on each link of the learner, t_j = sum_i W_ij e_i.
     """
-    correspondence, weights = metric.correspondence, cast(DistanceWeights, metric.weights)
+    correspondence, weights = cast(Any, metric.correspondence), cast(DistanceWeights, metric.weights)
     directions, positions = (_pair_weights(correspondence, w) for w in (weights.rotation, weights.translation))
     pairs = _weighted_pairs(correspondence, weights.translation) if chosen is None else chosen
     angles = None
