@@ -141,16 +141,13 @@ def unseen_motions(motions: Results) -> list[Cells]:
     return rows
 
 
-def overview(study: Results, preset: Results, pose: Results) -> list[Cells]:
+def overview(training: Results, pose: Results) -> list[Cells]:
     """The table of the README."""
-    runs = [preset_runs(preset, env) for env in ENVIRONMENTS]
-    ppo = [split_pair({split: mean(reports, split) for split in ("train", "held_out")}) for reports in runs]
-    exact = [split_pair(study["results"][f"{env}--computed_torque"][0]["optimality_gap"]) for env in ENVIRONMENTS]
+    _, *kinds = kinds_of_motions(training)
     rates = {result["pair"]: large(result["methods"]["newton"]["poses_per_second"]) for result in pose["results"]}
     return [
         ("", "7 joints", "4 joints", "3 joints"),
-        ("gap of PPO on training / held-out demonstrations [%], three seeds", *ppo),
-        ("the same for computed torque, with the exact model and the whole motion known", *exact),
+        *((f"gap of PPO on held-out motions, {kind} [%]", *cells) for kind, *cells in kinds),
         ("poses at their optimum per second", rates["panda 7->7"], rates["panda 7->4"], ""),
     ]
 
@@ -224,23 +221,6 @@ def policy_similarity(preset: Results) -> list[Cells]:
             cells.append(split_pair(means, form, 1))
         rows.append(cells)
     return rows
-
-
-def controllers(study: Results, preset: Results, any_arm: Results) -> list[Cells]:
-    def gaps(case: str) -> list[str]:
-        return [split_pair(study["results"][f"{env}--{case}"][0]["optimality_gap"], ".2f") for env in ENVIRONMENTS]
-
-    nearest = [f"- / {100 * one(any_arm['presets'], arm=env)['gap']:.2f}" for env in ENVIRONMENTS]
-    runs = [preset_runs(preset, env) for env in ENVIRONMENTS]
-    ppo = [split_pair({split: mean(reports, split) for split in ("train", "held_out")}) for reports in runs]
-    return [
-        ("gap, training / held out [%]", *ENVIRONMENTS.values()),
-        ("PD (frequency tuned)", *gaps("pd")),
-        ("computed torque, exact dynamics", *gaps("computed_torque")),
-        ("nearest pose, exact dynamics", *nearest),
-        ("PPO, mean of three seeds", *ppo),
-        ("searched torques, the whole motion known", *gaps("searched")),
-    ]
 
 
 def pretrained(reports: Results) -> list[Cells]:
