@@ -6,15 +6,17 @@ An expert is a law that gives the torques of a control step from the arm's state
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import BPoly
 
 from mimic.arms.arm import Arm, finite_velocity_limit
 from mimic.arms.simulation_model import effective_inertia
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BPoly
 
 MIXED = "mixed"  # each of `KINDS` in turn
 GOAL_SHARE = 0.5  # goals lie within this fraction of the way from the home pose to the joint limits
@@ -23,7 +25,7 @@ GOAL_SHARE = 0.5  # goals lie within this fraction of the way from the home pose
 GOAL_FREQUENCY = 2.0  # rad/s
 _PID_INTEGRAL = 0.3  # rad/s, the slow pole of a PID controller, beside two at `GOAL_FREQUENCY`
 PATH_FREQUENCY = 4.0  # rad/s, of the feedback along a path
-REACH_FRACTION = 0.6  # fraction of an episode after which the expert has reached its goal and stays there
+REACH_TIME = 3.0  # s, after which the hand has reached its goal and stays there
 _REACH_SPEED_FRACTION = 0.9  # of the velocity limit, for inverse kinematics; the feedback needs the rest
 _REACH_DAMPING = 1e-2  # regularises inverse kinematics near the stretched arm, a singularity where episodes start
 _REACH_SETTLING = 5  # steps at the goal, after which inverse kinematics no longer moves the arm
@@ -130,11 +132,13 @@ def _splines(arm: Arm, rng: np.random.Generator, horizon: int, dt: float) -> Exp
 
 def _spline(
     draw_goal: Callable[[], np.ndarray], start: np.ndarray, speed: np.ndarray, end: float, rng: np.random.Generator
-) -> BPoly:
+) -> "BPoly":
     """A quintic spline from rest at a start through random goals, with continuous acceleration, at least until `end`.
 
     Velocities at goals are those of the chord from the goal before to the goal after, and 0 at both ends of a rest.
     """
+    from scipy.interpolate import BPoly  # takes half a second, and only this kind of demonstration needs it
+
     times, goals, moves = [0.0], [start], []
     while times[-1] <= end:
         rests = rng.random() < _HOLD_PROBABILITY
@@ -183,9 +187,9 @@ def _reach_path(
     end = mink.Configuration(model, goal).get_transform_frame_to_world(hand, "body")
     task = mink.FrameTask(hand, "body", position_cost=1.0, orientation_cost=0.3)  # 0.3 m/rad: the reach of a hand
     path, path_velocity = [configuration.q.copy()], []
-    moving = math.ceil(REACH_FRACTION * horizon)
+    moving = math.ceil(REACH_TIME / dt)
     for step in range(horizon):
-        progress = min((step + 1) / (REACH_FRACTION * horizon), 1.0)
+        progress = min((step + 1) * dt / REACH_TIME, 1.0)
         velocity = np.zeros_like(goal)
         if step < moving + _REACH_SETTLING:  # the rest is at the goal
             task.set_target(start.interpolate(end, alpha=10 * progress**3 - 15 * progress**4 + 6 * progress**5))

@@ -104,7 +104,10 @@ DAMAGES = {
     "a pickle": (lambda: pickle.dumps(ARRAYS), "it is no zip archive, or its end is missing"),
     "a line break in a name": (lambda: archive(npy(ONE_TEXT, b"\n\0\0\0")), "a has text that cannot be printed"),
     "no character": (lambda: archive(npy(ONE_TEXT, b"\xff" * 4)), ""),
-    "much text": (lambda: archive(npy(header("'<U1'", f"({MAX_TEXT},)"), bytes(4 * MAX_TEXT))), "a has 4194304 bytes"),
+    "much text": (
+        lambda: archive(npy(header("'<U1'", f"({MAX_TEXT},)"), bytes(4 * MAX_TEXT))),
+        f"a has {4 * MAX_TEXT} bytes",
+    ),
 }
 
 

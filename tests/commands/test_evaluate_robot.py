@@ -214,7 +214,11 @@ def test_what_the_safety_layer_cannot_run_is_rejected(tmp_path, settings, messag
             "policy, hold or tracking for a run with an inner loop and control=joint_velocity",
         ),
         ({"world": "nominal", "control": "torque"}, "tracking", "policy or hold for a run with an inner loop and"),
-        ({}, "tracking", "policy, hold, pd, computed_torque or nearest_pose for a run with no inner loop"),
+        (
+            {},
+            "tracking",
+            "policy, hold, copy_joints, pd, computed_torque, one_step or nearest_pose for a run with no inner loop",
+        ),
     ],
 )
 def test_controllers_whose_commands_the_run_does_not_have(settings, controller, message):
