@@ -38,14 +38,14 @@ def demo_data(name: str) -> dict[str, Any]:
     network = mimic.load(name, "pose_mapper")
     assert isinstance(network.function, mimic.PoseMapper)
     model, params = network.function.model, network.function.params["params"]
-    config, metric = model.config, model.built_metric
+    config, metric = model.config, model.pair().metric
     if (config.inputs, config.outputs, config.activation) != ("link_states", "circle", "gelu") or not metric.is_static:
         raise ValueError(f"{name}: expected a mapper of the preset large and a static metric, got {config}")
     kernels = [params[f"Dense_{i}"] for i in range(len(params))]
     return {
         "name": name,
-        "expert": _arm(model.expert),
-        "learner": _arm(model.learner),
+        "expert": _arm(model.expert.embodiment),
+        "learner": _arm(model.learner.embodiment),
         "correspondence": np.asarray(metric.correspondence).tolist(),
         "weights": {part: float(getattr(metric.weights, part)) for part in ("translation", "rotation")},
         "heads": config.heads,

@@ -42,12 +42,12 @@ def script_of(name):
 def test_javascript_computes_what_jax_computes(name):
     mapper = mimic.load(name, "pose_mapper")
     model = mapper.function.model  # type: ignore[attr-defined]
-    poses = random_poses(mapper.expert)
+    pair, poses = model.pair(), random_poses(mapper.expert)
     computed = in_node(script_of(name), poses)
     with jax.enable_x64(True):
         params = jax.tree.map(lambda x: np.asarray(x, np.float64), mapper.function.params)  # type: ignore[attr-defined]
-        answers = np.asarray(jax.jit(jax.vmap(lambda pose: model(params, pose)))(poses))
-        distance = jax.jit(jax.vmap(model.distance))
+        answers = np.asarray(jax.jit(jax.vmap(lambda pose: model(params, pair.target(pose))))(poses))
+        distance = jax.jit(jax.vmap(lambda expert, learner: pair.target(expert).distance(learner)))
         expected = {"mapper": answers, "copy": copy_joints(mapper.expert, mapper.learner, poses)}
         distances = {key: distance(poses, pose) for key, pose in expected.items()}
     for key, pose in expected.items():
