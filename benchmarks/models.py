@@ -114,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options: argparse.Namespace = parser.parse_args(arguments)
     logging.getLogger("mimic").setLevel(logging.ERROR)
     try:
-        import pinocchio
+        import pinocchio  # pyright: ignore[reportMissingImports]  # not among the packages of the project
     except ImportError:
         pinocchio = None
     rows: list[Row] = []

@@ -141,7 +141,9 @@ def rows(name: str, start: str, unseen: Demonstrations, policies: list[tuple[Pat
     for controller in ("policy", *controllers):
         seeds = policies if controller == "policy" else policies[:1]
         outcomes = [trainer.run_controller(controller, _params(trainer, path))[0] for path, _ in seeds]
-        similarity = {key: float(x[part].mean()) for key, x in evaluator.similarity(outcomes[0].qpos).items()}
+        similarity = {
+            key: float(x[part].mean()) for key, x in evaluator.similarity(np.asarray(outcomes[0].qpos)).items()
+        }
         distance = np.stack([np.asarray(outcome.distance)[part] for outcome in outcomes]).astype(float)
         bound, hold = evaluator.lower_bound[part].astype(float), evaluator.hold_distance[part].astype(float)
         for label, window in windows.items():

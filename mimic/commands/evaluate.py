@@ -116,7 +116,7 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
     if config.torque_noise is not None:
         changes["torque_noise"] = config.torque_noise
     if trained.trainer.name != "ppo":
-        others = config.physics, config.demonstrations, config.learner
+        others = config.physics, config.demonstrations, config.split, config.learner
         if changes or any(others) or config.controller != "policy":
             raise ValueError(
                 "controller, learner, demonstrations, physics, mass, damping and torque_noise: expected a run of "
@@ -144,6 +144,8 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
 def _unseen(config: EvaluateConfig, env: EnvConfig) -> Demonstrations | None:
     """The demonstrations that replace the held-out ones; None where nothing does."""
     if config.split:
+        from mimic.envs.imitation import test_demonstrations  # imports MJX, which takes seconds
+
         Console().print("recording the test set; its kinematic bound takes minutes on a CPU", highlight=False)
         return test_demonstrations(env)
     return load_demonstrations(Path(config.demonstrations).expanduser()) if config.demonstrations else None

@@ -124,7 +124,9 @@ def _load_mapper(config: ViewConfig) -> "PoseMapper":
         return PoseMapper.load(run_dir, config.checkpoint)
     if config.checkpoint is not None:
         raise ValueError(f"checkpoint: expected none with mapper={config.mapper}, which comes with mimic")
-    return read_network(NETWORKS / f"{config.mapper}-pose_mapper", "pose_mapper").function
+    mapper = read_network(NETWORKS / f"{config.mapper}-pose_mapper", "pose_mapper").function
+    assert isinstance(mapper, PoseMapper)
+    return mapper
 
 
 def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:

@@ -108,7 +108,7 @@ def _split(begins: np.ndarray, length: float, held_out: float) -> tuple[int, lis
     for count in range(max(1, round(held_out * len(begins))), 0, -1):
         training = np.flatnonzero(begins + length <= begins[-count:][:1] + 1e-9)
         if len(training):
-            return len(training), [*training, *range(len(begins) - count, len(begins))]
+            return len(training), [*map(int, training), *range(len(begins) - count, len(begins))]
     return 0, []
 
 

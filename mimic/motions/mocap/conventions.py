@@ -64,7 +64,7 @@ def find_up(motion: PointMotion, usual: str, stated: str = "", rest: np.ndarray 
       stated: axis that the file states; "" for none.
       rest: positions of the points of a skeleton at rest [points, 3].
     """
-    votes = dict.fromkeys(UPS, 0.0)
+    votes: dict[str, float] = dict.fromkeys(UPS, 0.0)
     votes[usual] += _WEIGHTS["usual"]
     body, how = _body_axis(motion)
     evidence = {"stated": stated, "floor": _floor_axis(motion, (body, stated, usual)) if "feet" in how else ""}

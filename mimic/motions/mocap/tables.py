@@ -3,7 +3,7 @@
 import csv
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -121,7 +121,7 @@ def read_npz(path: Path) -> Table:
     if time.dtype.kind not in "fiu" or time.shape != positions.shape[:1]:
         raise ValueError(f"time: expected {len(positions)} numbers, got shape {time.shape}")
     parents = _parents(content["parents"], len(names)) if "parents" in content else None
-    texts = {key: str(content[key]) for key in ("unit", "up") if key in content}
+    texts: dict[str, Any] = {key: str(content[key]) for key in ("unit", "up") if key in content}
     values = positions.astype(float), time.astype(float)
     return _checked(Table(tuple(map(str, names)), *values, parents=parents, rate=stated, **texts))
 

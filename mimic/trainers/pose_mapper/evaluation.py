@@ -111,7 +111,9 @@ def _reference_of_one_pair(model: MapperModel, pair: Pair, make_key: MakeKey, po
 
 
 def _directions(arm: Any, poses: Array) -> Array:
-    return jax.vmap(lambda qpos: link_states(arm, qpos).direction)(poses)
+    directions = jax.vmap(lambda qpos: link_states(arm, qpos).direction)(poses)
+    assert directions is not None
+    return directions
 
 
 def _reference_of_arrays(model: MapperModel, pair: Pair, make_key: MakeKey, poses: Array) -> Reference:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arm import build_arm
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
+from mimic.arms.embodiment import Embodiment
 from mimic.base.compilation import on_host
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import check_metric
@@ -45,6 +46,12 @@ class MapperModel:
     def takes_any_expert(self) -> bool:
         """Whether the expert may be any arm too."""
         return self.learner is None and self.env.arms is not None and self.env.arms.expert == "drawn"
+
+    @property
+    def embodiments(self) -> tuple[Embodiment, Embodiment]:
+        """Expert and learner of a mapper that has one pair."""
+        assert self.learner is not None
+        return self.expert.embodiment, self.learner.embodiment
 
     @property
     def starts(self) -> int:

@@ -69,10 +69,11 @@ class Target:
     def improved(self, poses: Poses, steps: int) -> Poses:
         """Poses of the learner after Newton steps [rad]; of arms as arrays alone."""
         learner, metric = self.pair.learner, self.pair.metric
-        assert isinstance(learner, ArmArrays) and isinstance(metric.weights, DistanceWeights)
+        weights, matrix = metric.weights, jnp.asarray(metric.correspondence)
+        assert isinstance(learner, ArmArrays) and isinstance(weights, DistanceWeights)
 
         def improve(qpos: Array) -> Array:
-            return nearest_pose(learner, metric.weights, metric.correspondence, self.states, qpos, steps).qpos
+            return nearest_pose(learner, weights, matrix, self.states, qpos, steps).qpos
 
         return jax.vmap(improve)(poses) if steps else poses
 

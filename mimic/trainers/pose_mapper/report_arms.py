@@ -107,8 +107,8 @@ class OnePair(ReportArms):
             np.asarray(qpos)[few, None] for qpos in (pairs.expert_qpos, mapped.qpos[0], reference.optimal_qpos[0])
         )  # motions of one sample
         poses = {"mapper": mapped_qpos, "nearest_poses": optimal_qpos}
-        pair = self._model.pair()
-        return pose_similarity(pair.expert, pair.learner, expert_qpos, poses, split="held_out")
+        expert, learner = self._model.embodiments
+        return pose_similarity(expert, learner, expert_qpos, poses, split="held_out")
 
 
 class ManyArms(ReportArms):
@@ -153,6 +153,7 @@ class ManyArms(ReportArms):
         arms = arms_of_report(env)
         if arms[SEEN]:
             return arms
+        assert self.sampler is not None
         drawn = jax.device_get(jax.jit(jax.vmap(self.sampler))(jax.random.split(self.key(_ARMS), _DRAWN_ARMS)))
         return {**arms, SEEN: {f"drawn {i}": jax.tree.map(lambda x, i=i: x[i], drawn) for i in range(_DRAWN_ARMS)}}
 

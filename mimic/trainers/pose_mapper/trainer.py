@@ -162,13 +162,14 @@ class PoseMapperTrainer(Trainer):
 
     def _angles(self, mapped: Mapped) -> Metrics:
         """Median angles [deg] of each link on held-out poses: to the expert's corresponding links, to the optimum."""
-        reference, pair, place = self._reference[ARMS], self.model.pair(), self._arms.splits["held_out"]
+        reference, place = self._reference[ARMS], self._arms.splits["held_out"]
+        expert_arm, learner_arm = self.model.embodiments
         directions = reference.expert_direction, mapped.direction, reference.optimal_direction
         expert, learner, optimum = (direction[place][0] for direction in directions)
-        fractions = self.env_config.metric.link_fractions(pair.expert, pair.learner)
+        fractions = self.env_config.metric.link_fractions(expert_arm, learner_arm)
         angles = np.einsum("ij,pij->pj", fractions, _angle(expert[:, :, None], learner[:, None]))
         to_expert, to_optimum = np.median(angles, axis=0), np.median(_angle(learner, optimum), axis=0)
-        names = pair.learner.link_names
+        names = learner_arm.link_names
         return {
             "link_angle_error_deg": float(to_expert.mean()),
             "link_angle_error_deg_by_link": dict(zip(names, map(float, to_expert), strict=True)),
@@ -199,7 +200,7 @@ class PoseMapperTrainer(Trainer):
         if self.model.learner is None:
             return None
         pair, poses = self.model.pair(), self.pairs[ARMS].expert_qpos
-        copied = copy_joints(pair.expert, pair.learner, poses)
+        copied = copy_joints(*self.model.embodiments, poses)
         if copied is None:
             return None
         distance = jax.vmap(lambda qpos, learner_qpos: pair.target(qpos).distance(learner_qpos))
