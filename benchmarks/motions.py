@@ -47,32 +47,41 @@ AMPLITUDE = 0.4  # rad, of the figure of eight
 
 def circles(arm: Arm, count: int, horizon: int, dt: float) -> Demonstrations:
     """Demonstrations whose hand draws a circle around a random axis, one a period after a rest."""
-    model, embodiment = arm.model, arm.embodiment
+    motions: list[np.ndarray] = []
+    rng = np.random.default_rng(7)
+    while len(motions) < count:
+        path = _circle(arm, rng, horizon, dt)
+        if np.all(np.abs(np.gradient(path, dt, axis=0)) <= arm.embodiment.velocity_limit):
+            motions.append(path)
+    return _from_paths(arm, np.array(motions), dt, "circle")
+
+
+def _circle(arm: Arm, rng: np.random.Generator, horizon: int, dt: float) -> np.ndarray:
+    """Joint angles [horizon + 1, joints] of one circle from a random pose."""
+    model, home = arm.model, np.asarray(arm.embodiment.home)
     task = mink.FrameTask(model.nbody - 1, "body", position_cost=1.0, orientation_cost=0.1)
     posture = mink.PostureTask(model, 1e-3)
-    motions = []
-    for index in range(count):
-        rng = np.random.default_rng([7, index])
-        lower, upper = np.asarray(embodiment.joint_range).T
-        start = np.asarray(embodiment.home) + rng.uniform(0.25, 0.45, len(lower)) * (
-            rng.choice([lower, upper]) - np.asarray(embodiment.home)
-        )
-        configuration = mink.Configuration(model, start)
-        frame = configuration.get_transform_frame_to_world(model.nbody - 1, "body")
-        axes, posture_target = np.linalg.qr(rng.normal(size=(3, 3)))[0], start
-        posture.set_target(posture_target)
-        path = [start]
-        for step in range(1, horizon + 1):
-            time = step * dt
-            angle = 2 * np.pi * (time / PERIOD) * min(1.0, time / 1.0)  # from rest
-            offset = RADIUS * (axes[0] * (np.cos(angle) - 1) + axes[1] * np.sin(angle))
-            task.set_target(mink.SE3.from_rotation_and_translation(frame.rotation(), frame.translation() + offset))
-            for _ in range(3):
-                velocity = mink.solve_ik(configuration, [task, posture], dt, solver="daqp", damping=1e-4)
-                configuration.integrate_inplace(velocity, dt)
-            path.append(configuration.q.copy())
-        motions.append(path)
-    return _from_paths(arm, np.array(motions), dt, "circle")
+    ends = np.asarray(arm.embodiment.joint_range)[np.arange(len(home)), rng.integers(2, size=len(home))]
+    start = home + rng.uniform(0.25, 0.45, len(home)) * (ends - home)
+    configuration = mink.Configuration(model, start)
+    frame, axes = configuration.get_transform_frame_to_world(model.nbody - 1, "body"), _random_axes(rng)
+    posture.set_target(start)
+    path = [start]
+    for step in range(1, horizon + 1):
+        time = step * dt
+        angle = 2 * np.pi * (time / PERIOD) * min(1.0, time / 1.0)  # from rest
+        offset = RADIUS * (axes[0] * (np.cos(angle) - 1) + axes[1] * np.sin(angle))
+        task.set_target(mink.SE3.from_rotation_and_translation(frame.rotation(), frame.translation() + offset))
+        for _ in range(3):
+            velocity = mink.solve_ik(configuration, [task, posture], dt, solver="daqp", damping=1e-4)
+            configuration.integrate_inplace(velocity, dt)
+        path.append(configuration.q.copy())
+    return np.array(path)
+
+
+def _random_axes(rng: np.random.Generator) -> np.ndarray:
+    """Three random orthogonal unit vectors."""
+    return np.linalg.qr(rng.normal(size=(3, 3)))[0]
 
 
 def figures_of_eight(arm: Arm, count: int, horizon: int, dt: float) -> Demonstrations:
