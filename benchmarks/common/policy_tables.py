@@ -147,7 +147,7 @@ def overview(training: Results, pose: Results) -> list[Cells]:
     rates = {result["pair"]: large(result["methods"]["newton"]["poses_per_second"]) for result in pose["results"]}
     return [
         ("", "7 joints", "4 joints", "3 joints"),
-        *((f"gap of PPO on held-out motions, {kind} [%]", *cells) for kind, *cells in kinds),
+        *((f"{kind} [%]", *(cell.replace(" to ", "–") for cell in cells)) for kind, *cells in kinds[:-1]),
         ("poses at their optimum per second", rates["panda 7->7"], rates["panda 7->4"], ""),
     ]
 
