@@ -25,13 +25,8 @@ from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.trainer import Trainer
 
 CONTROLLERS_OF_MANY = ("policy", "nearest_pose")
-TORQUE_CONTROLLERS = (
-    "copy_joints",
-    "pd",
-    "computed_torque",
-    "one_step",
-    "nearest_pose",
-)  # for actions that are torques
+# For actions that are torques, and for those that are other targets of an inner loop.
+TORQUE_CONTROLLERS = ("copy_joints", "pd", "computed_torque", "one_step", "nearest_pose")
 TARGET_CONTROLLERS = ("tracking",)
 
 
@@ -119,7 +114,7 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
         others = config.physics, config.demonstrations, config.split, config.learner
         if changes or any(others) or config.controller != "policy":
             raise ValueError(
-                "controller, learner, demonstrations, physics, mass, damping and torque_noise: expected a run of "
+                "controller, learner, demonstrations, split, physics, mass, damping, torque_noise: expected a run of "
                 f"trainer=ppo, got one of {trained.trainer.name}"
             )
         return trained, make_trainer(trained, run_dir)
