@@ -70,6 +70,21 @@ class Link:
 
 
 @dataclasses.dataclass(frozen=True)
+class Hand:
+    """The hand frame at the end of a chain in the zero pose, in the base frame.
+
+    Attributes:
+      position: [3] the tool's working point [m].
+      rotation: [3, 3] z-axis along the approach, x-axis in the direction in which the gripper opens.
+      joint: index of the last joint that moves it; -1 for none.
+    """
+
+    position: np.ndarray
+    rotation: np.ndarray
+    joint: int
+
+
+@dataclasses.dataclass(frozen=True)
 class Chain:
     """Joints and links from the base to the tip, or to the tips of a tree of chains.
 
@@ -78,12 +93,14 @@ class Chain:
       links: in the order of the joints that move them.
       parents: index of each joint's parent, -1 for a joint at the base; None for one chain.
       names: of the chains.
+      hands: one at the end of each chain; empty for an arm without a known hand.
     """
 
     joints: tuple[Joint, ...]
     links: tuple[Link, ...]
     parents: tuple[int, ...] | None = None
     names: tuple[str, ...] = ("arm",)
+    hands: tuple[Hand, ...] = ()
 
     @property
     def joint_parents(self) -> tuple[int, ...]:
@@ -170,7 +187,8 @@ def lock(chain: Chain, locked: Mapping[str, float], links: Links = "kept") -> Ch
         result.append(moved)
         previous_joint = link.joint
     parents = None if chain.parents is None else parents
-    return dataclasses.replace(chain, joints=joints, links=drop_zero_length(result), parents=parents)
+    hands = tuple(_moved_hand(hand, *placement[hand.joint], new_index[hand.joint]) for hand in chain.hands)
+    return dataclasses.replace(chain, joints=joints, links=drop_zero_length(result), parents=parents, hands=hands)
 
 
 _Placements = dict[int, tuple[np.ndarray, np.ndarray]]
@@ -204,6 +222,30 @@ def _moved(link: Link, rotation: np.ndarray, offset: np.ndarray, joint: int) -> 
 
     merged = tuple((move(start), move(end)) for start, end in link.merged)
     return dataclasses.replace(link, start=move(link.start), end=move(link.end), joint=joint, merged=merged)
+
+
+def _moved_hand(hand: Hand, rotation: np.ndarray, offset: np.ndarray, joint: int) -> Hand:
+    return Hand(rotation @ hand.position + offset, rotation @ hand.rotation, joint)
+
+
+def with_hands_along_links(chain: Chain) -> Chain:
+    """The chain with a hand at the end of the last link of each of its chains, whose approach is along this link."""
+    last = [[link for link in chain.links if number in link.chains][-1] for number in range(len(chain.names))]
+    hands = (Hand(link.end, rotation_between("z", (link.end - link.start) / link.length), link.joint) for link in last)
+    return dataclasses.replace(chain, hands=tuple(hands))
+
+
+def rotation_between(axis: Literal["x", "z"], direction: np.ndarray) -> np.ndarray:
+    """The smallest rotation that maps a coordinate axis onto a unit direction."""
+    index = "xyz".index(axis)
+    cosine, unit = direction[index], np.eye(3)[index]
+    square_sine = np.sum(np.square(np.delete(direction, index)))
+    if cosine < 0 and square_sine < 1e-24:  # opposite: rotation by pi about the next axis but one
+        return np.roll(np.diag([-1.0, -1.0, 1.0]), index, axis=(0, 1))
+    # Both are 1 / (1 + cosine), each where it does not suffer from cancellation.
+    factor = 1 / (1 + cosine) if cosine > 0 else (1 - cosine) / square_sine
+    skew = np.cross(np.eye(3), np.cross(unit, direction))
+    return np.eye(3) + skew + factor * skew @ skew
 
 
 def _merged(first: Link, second: Link) -> Link:

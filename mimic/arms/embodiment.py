@@ -13,7 +13,17 @@ from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from mimic.arms.chain import Chain, Joint, Link, Links, Locked, lock, resolve_locked
+from mimic.arms.chain import (
+    Chain,
+    Joint,
+    Link,
+    Links,
+    Locked,
+    lock,
+    resolve_locked,
+    rotation_between,
+    with_hands_along_links,
+)
 from mimic.arms.compile_check import check_magnitudes
 from mimic.arms.kinematic_tree import Tip
 from mimic.arms.model_files import model_name, read_model
@@ -51,10 +61,15 @@ class Embodiment:
       link_joint: index of the last joint that moves each link; -1 for a link fixed to the base.
       segment_start, segment_end: [num_segments, 3] segments of the arm's centre line in the zero pose, base to tip [m];
         one for each link, more where locked joints merged links into chords.
+      hand_position: [num_hands, 3] origins of the hand frames in the zero pose, the tools' working points [m]; one for
+        each chain, none where no hand is known.
+      hand_rotation: [num_hands, 3, 3] hand frames in the zero pose: the z-axis along the approach, the x-axis in the
+        direction in which the gripper opens.
       segment_link: index of the link of each segment.
       joint_parent: index of each joint's parent, -1 for a joint at the base.
       chains: indices of the links of each chain, base to tip; several chains may begin with the same links.
       chain_names: names of the chains: "arm", or those of the tips of a tree.
+      hand_joint: index of the last joint that moves each hand; -1 for none.
     """
 
     joint_axis: Float[Any, "joints 3"]
@@ -68,6 +83,8 @@ class Embodiment:
     home: Float[Any, " joints"]
     segment_start: Float[Any, "segments 3"]
     segment_end: Float[Any, "segments 3"]
+    hand_position: Float[Any, "hands 3"]
+    hand_rotation: Float[Any, "hands 3 3"]
     name: str = struct.field(pytree_node=False)
     joint_names: tuple[str, ...] = struct.field(pytree_node=False)
     link_names: tuple[str, ...] = struct.field(pytree_node=False)
@@ -76,6 +93,7 @@ class Embodiment:
     joint_parent: tuple[int, ...] = struct.field(pytree_node=False)
     chains: tuple[tuple[int, ...], ...] = struct.field(pytree_node=False)
     chain_names: tuple[str, ...] = struct.field(pytree_node=False)
+    hand_joint: tuple[int, ...] = struct.field(pytree_node=False)
 
     def __repr__(self) -> str:
         return f"Embodiment({self.name}: {self.num_joints} joints, {self.num_links} links)"
@@ -121,7 +139,7 @@ def planar_arm(link_lengths: Sequence[float] | Float[ArrayLike, " n"], *, frame_
     points = np.stack([ends, 0 * ends, 0 * ends], axis=1)
     joints = tuple(Joint(f"joint{i + 1}", np.array([0.0, 0.0, 1.0]), points[i]) for i in range(lengths.size))
     links = tuple(Link(f"link{i + 1}", points[i], points[i + 1], i) for i in range(lengths.size))
-    return from_chain(Chain(joints, links), name=f"planar{lengths.size}", frame_at=frame_at)
+    return from_chain(with_hands_along_links(Chain(joints, links)), name=f"planar{lengths.size}", frame_at=frame_at)
 
 
 def panda_path(name: str = "panda") -> str:
@@ -226,7 +244,7 @@ def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
         joint_axis=snap_to_units(np.stack([joint.axis for joint in joints])),
         joint_anchor=snap_to_units(np.stack([joint.anchor for joint in joints])),
         link_position=snap_to_units(np.stack([link.start + frame_at * (link.end - link.start) for link in links])),
-        link_rotation=snap_to_units(np.stack([_rotation_to(direction) for direction in directions])),
+        link_rotation=snap_to_units(np.stack([rotation_between("x", direction) for direction in directions])),
         link_lengths=np.array([link.length for link in links]),
         joint_range=np.array([joint.range for joint in joints]),
         torque_limit=np.array([joint.torque_limit for joint in joints]),
@@ -234,6 +252,8 @@ def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
         home=np.array([joint.home for joint in joints]),
         segment_start=np.stack([start for start, _, _ in segments]),
         segment_end=np.stack([end for _, end, _ in segments]),
+        hand_position=snap_to_units(np.array([hand.position for hand in chain.hands]).reshape(-1, 3)),
+        hand_rotation=snap_to_units(np.array([hand.rotation for hand in chain.hands]).reshape(-1, 3, 3)),
         name=name,
         joint_names=tuple(joint.name for joint in joints),
         link_names=tuple(link.name for link in links),
@@ -245,6 +265,7 @@ def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
             for number in range(len(chain.names))
         ),
         chain_names=chain.names,
+        hand_joint=tuple(hand.joint for hand in chain.hands),
     )
 
 
@@ -256,7 +277,7 @@ def segment_arm(arm: Embodiment) -> Embodiment:
     return dataclasses.replace(
         arm,
         link_position=snap_to_units(start),
-        link_rotation=snap_to_units(np.stack([_rotation_to(direction) for direction in directions])),
+        link_rotation=snap_to_units(np.stack([rotation_between("x", direction) for direction in directions])),
         link_lengths=lengths,
         link_names=tuple(f"segment{i + 1}" for i in range(len(lengths))),
         link_joint=tuple(arm.link_joint[link] for link in arm.segment_link),
@@ -277,6 +298,7 @@ def in_chain_lengths(arm: Embodiment) -> Embodiment:
         link_lengths=arm.link_lengths / length,
         segment_start=arm.segment_start / length,
         segment_end=arm.segment_end / length,
+        hand_position=arm.hand_position / length,
     )
 
 
@@ -302,14 +324,3 @@ def snap_to_units(values: np.ndarray) -> np.ndarray:
     """
     nearest = np.clip(np.round(values), -1, 1)
     return np.where(np.abs(values - nearest) < 1e-12, nearest, values)
-
-
-def _rotation_to(direction: np.ndarray) -> np.ndarray:
-    """The smallest rotation that maps the x-axis onto a unit direction."""
-    cosine, square_sine = direction[0], direction[1] ** 2 + direction[2] ** 2
-    if cosine < 0 and square_sine < 1e-24:  # opposite: rotation by pi about z
-        return np.diag([-1.0, -1.0, 1.0])
-    # Both are 1 / (1 + cosine), each where it does not suffer from cancellation.
-    factor = 1 / (1 + cosine) if cosine > 0 else (1 - cosine) / square_sine
-    skew = np.cross(np.eye(3), np.cross([1.0, 0.0, 0.0], direction))
-    return np.eye(3) + skew + factor * skew @ skew

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.chain import SHORTEST_LINK, Chain, Joint, Link, drop_zero_length
+from mimic.arms.chain import SHORTEST_LINK, Chain, Joint, Link, drop_zero_length, with_hands_along_links
 from mimic.arms.compile_check import VELOCITY_LIMIT, joint_numbers
 from mimic.arms.hand import ArmEnd, find_end
 from mimic.arms.kinematic_tree import Tip, find_chain
@@ -62,9 +62,9 @@ def read_chain(model: mujoco.MjModel, base: str | None = None, tip: Tip = None, 
         tips = [in_base(_chain_end(model, data, chain[-1], name).point) for chain, name in ends]
         links = (_base_links(joints, paths) if has_base else []) + _anchor_links(joints, paths, tips)
     if len(paths) == 1:
-        return Chain(tuple(joints), drop_zero_length(links))
+        return with_hands_along_links(Chain(tuple(joints), drop_zero_length(links)))
     parents = tuple(_parent(joint, paths) for joint in range(len(joints)))
-    return Chain(tuple(joints), drop_zero_length(links), parents, chain_ids.names)
+    return with_hands_along_links(Chain(tuple(joints), drop_zero_length(links), parents, chain_ids.names))
 
 
 def _check_names(joints: Sequence[Joint]) -> None:
