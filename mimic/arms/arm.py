@@ -13,6 +13,7 @@ from jaxtyping import Float
 from mimic.arms.chain import Links
 from mimic.arms.compile_check import VELOCITY_LIMIT
 from mimic.arms.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
+from mimic.arms.hand import ArmEnd
 from mimic.arms.ignored_elements import ignored_elements
 from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.arms.model_files import read_spec
@@ -47,6 +48,9 @@ class ArmConfig:
       base: for a file, name of the body that carries the chain.
       tip: for a file, name of the body or site at the end of the chain; default: see `find_chain`. A list of names
         gives a tree with a chain to each of them, and ["*"] one to each end of the model.
+      hand: for a file, the hand's frame: the name of a site or body of the last link, whose z-axis is the approach and
+        whose x-axis the direction in which the gripper opens, or a pose [x, y, z, qw, qx, qy, qz] in the last link [m];
+        a list for several chains. Default: see `find_end`.
       armature: minimum rotor inertia of each joint, at the joint [kg m^2], or a mapping from joints to it; many models
         state none.
       damping: minimum damping of each joint [N m s/rad], or a mapping from joints to it.
@@ -60,6 +64,7 @@ class ArmConfig:
     link_lengths: list[float] = number(list, at_least=1e-3, at_most=100.0, entries=(0, 100))
     base: str | None = None
     tip: Any = None
+    hand: Any = None
     # Joints of the largest industrial robots have some 1000 kg m^2 and 1000 N m s/rad.
     armature: Any = number(0.0, at_least=0.0, at_most=1e4, by_name=True)
     damping: Any = number(0.0, at_least=0.0, at_most=1e4, by_name=True)
@@ -97,7 +102,7 @@ class Arm:
       locked: angle [rad] of the locked joints, by name.
       T_world_base: [4, 4] pose of the base frame in the world of the model, whose z-axis is vertical.
       notes: elements of its file that the model ignores, one line each.
-      ends: what each of its chains ends at, in words.
+      ends: where each of its chains ends, in the world of its file.
     """
 
     embodiment: Embodiment
@@ -105,7 +110,7 @@ class Arm:
     locked: Mapping[str, float]
     T_world_base: Float[np.ndarray, "4 4"]
     notes: tuple[str, ...] = ()
-    ends: tuple[str, ...] = ()
+    ends: tuple[ArmEnd, ...] = ()
 
 
 class ArmPair(NamedTuple):
@@ -150,13 +155,14 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
         locked=config.locked or (),
         base=config.base,
         tip=config.tip,
+        hand=config.hand,
         links=cast(Links, links),
         limits=cast(Limits, limits),
         home=config.home,
     )
     notes = () if not config.is_file else ignored_elements(source, config.base, config.tip)
     model = simulation_model(source, embodiment.joint_names, angles)
-    ends = chain_ends(source, config.base, config.tip)
+    ends = chain_ends(source, config.base, config.tip, config.hand)
     arm = Arm(embodiment, model, angles, base_pose(source, config.base, config.tip), notes, ends)
     return with_minimum_armature(arm, config)
 

@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterator
 
 import mujoco
 
-from mimic.arms.hand import named_frame
 from mimic.arms.model_tree import ancestors, is_revolute, joint_ids
 from mimic.arms.names import hand_rank, is_gripper_joint, is_other_limb
+from mimic.arms.tool_frames import named_frame
 
 _MAX_ENDS = 6  # in a message
 

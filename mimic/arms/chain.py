@@ -228,23 +228,14 @@ def _moved_hand(hand: Hand, rotation: np.ndarray, offset: np.ndarray, joint: int
     return Hand(rotation @ hand.position + offset, rotation @ hand.rotation, joint)
 
 
-def with_hands_along_links(chain: Chain) -> Chain:
-    """The chain with a hand at the end of the last link of each of its chains, whose approach is along this link."""
-    last = [[link for link in chain.links if number in link.chains][-1] for number in range(len(chain.names))]
-    hands = (Hand(link.end, rotation_between("z", (link.end - link.start) / link.length), link.joint) for link in last)
-    return dataclasses.replace(chain, hands=tuple(hands))
-
-
-def rotation_between(axis: Literal["x", "z"], direction: np.ndarray) -> np.ndarray:
-    """The smallest rotation that maps a coordinate axis onto a unit direction."""
-    index = "xyz".index(axis)
-    cosine, unit = direction[index], np.eye(3)[index]
-    square_sine = np.sum(np.square(np.delete(direction, index)))
-    if cosine < 0 and square_sine < 1e-24:  # opposite: rotation by pi about the next axis but one
-        return np.roll(np.diag([-1.0, -1.0, 1.0]), index, axis=(0, 1))
+def rotation_to(direction: np.ndarray) -> np.ndarray:
+    """The smallest rotation that maps the x-axis onto a unit direction."""
+    cosine, square_sine = direction[0], direction[1] ** 2 + direction[2] ** 2
+    if cosine < 0 and square_sine < 1e-24:  # opposite: rotation by pi about z
+        return np.diag([-1.0, -1.0, 1.0])
     # Both are 1 / (1 + cosine), each where it does not suffer from cancellation.
     factor = 1 / (1 + cosine) if cosine > 0 else (1 - cosine) / square_sine
-    skew = np.cross(np.eye(3), np.cross(unit, direction))
+    skew = np.cross(np.eye(3), np.cross([1.0, 0.0, 0.0], direction))
     return np.eye(3) + skew + factor * skew @ skew
 
 

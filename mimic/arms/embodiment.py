@@ -15,16 +15,18 @@ from jaxtyping import Float
 
 from mimic.arms.chain import (
     Chain,
+    Hand,
     Joint,
     Link,
     Links,
     Locked,
     lock,
     resolve_locked,
-    rotation_between,
-    with_hands_along_links,
+    rotation_to,
 )
 from mimic.arms.compile_check import check_magnitudes
+from mimic.arms.hand import HandChoice
+from mimic.arms.hand_axes import find_axes, find_wrist
 from mimic.arms.kinematic_tree import Tip
 from mimic.arms.model_files import model_name, read_model
 from mimic.arms.mujoco_chain import read_chain
@@ -139,7 +141,9 @@ def planar_arm(link_lengths: Sequence[float] | Float[ArrayLike, " n"], *, frame_
     points = np.stack([ends, 0 * ends, 0 * ends], axis=1)
     joints = tuple(Joint(f"joint{i + 1}", np.array([0.0, 0.0, 1.0]), points[i]) for i in range(lengths.size))
     links = tuple(Link(f"link{i + 1}", points[i], points[i + 1], i) for i in range(lengths.size))
-    return from_chain(with_hands_along_links(Chain(joints, links)), name=f"planar{lengths.size}", frame_at=frame_at)
+    wrist = find_wrist([joint.axis for joint in joints], [joint.anchor for joint in joints])
+    hand = Hand(points[-1], find_axes(points[-1], wrist).rotation, lengths.size - 1)
+    return from_chain(Chain(joints, links, hands=(hand,)), name=f"planar{lengths.size}", frame_at=frame_at)
 
 
 def panda_path(name: str = "panda") -> str:
@@ -170,6 +174,7 @@ def load_mjcf(
     locked: Locked = (),
     base: str | None = None,
     tip: Tip = None,
+    hand: HandChoice = None,
     links: Links = "kept",
     base_segment: bool = True,
 ) -> Embodiment:
@@ -187,6 +192,8 @@ def load_mjcf(
       base: name of the body that carries the chain; the base frame is then its frame.
       tip: name of the body or site at the end of the chain. A list of names gives a tree with a chain to each of them:
         two arms on a torso, a hand with fingers. ["*"] stands for all ends of the model.
+      hand: name of a site or body of the last link whose frame is the hand's (z: approach, x: opening), or a pose
+        [x, y, z, qw, qx, qy, qz] in the last link's body; for several chains a list. Default: see `find_end`.
       links: as for `panda`; of a tree always "kept".
       base_segment: whether the segment from the base to the first joint is a link; without effect where links are
         merged, because the paper has as many links as joints.
@@ -196,7 +203,7 @@ def load_mjcf(
         lacks, or what `panda` rejects.
     """
     model = _model(path_or_model)
-    chain = read_chain(model, base, tip, base_segment=base_segment and links == "kept")
+    chain = read_chain(model, base, tip, hand, base_segment=base_segment and links == "kept")
     angles = resolve_locked(locked, tuple(joint.name for joint in chain.joints))
     return _locked_embodiment(chain, angles, _name(path_or_model, model), links)
 
@@ -208,6 +215,7 @@ def load_arm(
     locked: Locked = (),
     base: str | None = None,
     tip: Tip = None,
+    hand: HandChoice = None,
     links: Links = "kept",
     limits: Limits = "hardware",
     home: Any = None,
@@ -218,7 +226,7 @@ def load_arm(
     """
     check_choice("limits", limits, LIMITS)
     model = _model(path_or_model)
-    chain = read_chain(model, base, tip, base_segment=links == "kept")
+    chain = read_chain(model, base, tip, hand, base_segment=links == "kept")
     if limits == "none":
         unlimited = (dataclasses.replace(joint, range=(-np.pi, np.pi), home=0.0) for joint in chain.joints)
         chain = dataclasses.replace(chain, joints=tuple(unlimited))
@@ -244,7 +252,7 @@ def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
         joint_axis=snap_to_units(np.stack([joint.axis for joint in joints])),
         joint_anchor=snap_to_units(np.stack([joint.anchor for joint in joints])),
         link_position=snap_to_units(np.stack([link.start + frame_at * (link.end - link.start) for link in links])),
-        link_rotation=snap_to_units(np.stack([rotation_between("x", direction) for direction in directions])),
+        link_rotation=snap_to_units(np.stack([rotation_to(direction) for direction in directions])),
         link_lengths=np.array([link.length for link in links]),
         joint_range=np.array([joint.range for joint in joints]),
         torque_limit=np.array([joint.torque_limit for joint in joints]),
@@ -277,7 +285,7 @@ def segment_arm(arm: Embodiment) -> Embodiment:
     return dataclasses.replace(
         arm,
         link_position=snap_to_units(start),
-        link_rotation=snap_to_units(np.stack([rotation_between("x", direction) for direction in directions])),
+        link_rotation=snap_to_units(np.stack([rotation_to(direction) for direction in directions])),
         link_lengths=lengths,
         link_names=tuple(f"segment{i + 1}" for i in range(len(lengths))),
         link_joint=tuple(arm.link_joint[link] for link in arm.segment_link),

@@ -82,12 +82,7 @@ def colours_along_arm(count: int) -> Float[np.ndarray, "links 3"]:
 
 def link_ends(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.ndarray, "links 2 3"]:
     """Start and end of each link in a pose [rad], in the base frame [m]; merged links are chords."""
-    transforms = [np.eye(4)]  # from the zero pose, of what no joint moves, the first joint, ...
-    for joint, (parent, angle) in enumerate(zip(arm.joint_parent, qpos, strict=True)):
-        axis, anchor = np.asarray(arm.joint_axis)[joint], np.asarray(arm.joint_anchor)[joint]
-        rotation = axis_rotation(axis, float(angle))
-        motion = np.block([[rotation, (anchor - rotation @ anchor)[:, None]], [np.eye(4)[3:]]])
-        transforms.append(transforms[parent + 1] @ motion)
+    transforms = _joint_transforms(arm, qpos)
     ends = np.empty((arm.num_links, 2, 3))
     segment_link = np.asarray(arm.segment_link)
     for link, joint in enumerate(arm.link_joint):
@@ -96,6 +91,25 @@ def link_ends(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.n
         transform = transforms[joint + 1]
         ends[link] = points @ transform[:3, :3].T + transform[:3, 3]
     return ends
+
+
+def hand_poses(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.ndarray, "hands 4 4"]:
+    """The hand frame of each chain in a pose [rad], in the base frame [m]; for pictures."""
+    transforms = _joint_transforms(arm, qpos)
+    poses = np.tile(np.eye(4), (len(arm.hand_joint), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = arm.hand_rotation, arm.hand_position
+    return np.array([transforms[joint + 1] @ pose for joint, pose in zip(arm.hand_joint, poses, strict=True)])
+
+
+def _joint_transforms(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> list[Float[np.ndarray, "4 4"]]:
+    """Transforms from the zero pose to a pose: of what no joint moves, of the first joint's link, and so on."""
+    transforms = [np.eye(4)]
+    for joint, (parent, angle) in enumerate(zip(arm.joint_parent, qpos, strict=True)):
+        axis, anchor = np.asarray(arm.joint_axis)[joint], np.asarray(arm.joint_anchor)[joint]
+        rotation = axis_rotation(axis, float(angle))
+        motion = np.block([[rotation, (anchor - rotation @ anchor)[:, None]], [np.eye(4)[3:]]])
+        transforms.append(transforms[parent + 1] @ motion)
+    return transforms
 
 
 def _by_name(arm: Embodiment, colours: Float[np.ndarray, "links 3"]) -> dict[str, Colour]:

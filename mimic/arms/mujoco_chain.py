@@ -8,11 +8,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.chain import SHORTEST_LINK, Chain, Joint, Link, drop_zero_length, with_hands_along_links
+from mimic.arms.chain import SHORTEST_LINK, Chain, Hand, Joint, Link, drop_zero_length
 from mimic.arms.compile_check import VELOCITY_LIMIT, joint_numbers
-from mimic.arms.hand import ArmEnd, find_end
-from mimic.arms.kinematic_tree import Tip, find_chain
-from mimic.arms.model_tree import is_revolute, tip_body
+from mimic.arms.hand import ArmEnd, HandChoice, find_end, given_ends
+from mimic.arms.kinematic_tree import ChainIds, Tip, find_chain
+from mimic.arms.model_tree import is_revolute
+from mimic.arms.tool_frames import find_frame
 
 START_POSES = "ready", "home"  # keyframes with the start pose of a model, in order of preference
 
@@ -26,12 +27,20 @@ _ALONG_AXIS = 1e-3  # rad; files round directions
 
 
 # Above 40 lines because of its docstring.
-def read_chain(model: mujoco.MjModel, base: str | None = None, tip: Tip = None, *, base_segment: bool = True) -> Chain:
+def read_chain(
+    model: mujoco.MjModel,
+    base: str | None = None,
+    tip: Tip = None,
+    hand: HandChoice = None,
+    *,
+    base_segment: bool = True,
+) -> Chain:
     """The revolute joints and links of a model, in a serial chain from body `base` to `tip`, or in a tree to its tips.
 
     Args:
       model: any.
       base, tip: see `find_chain`.
+      hand: see `given_ends`; default: see `find_end`.
       base_segment: add a link from the origin of the base body to the first joint, or to that of each branch at the
         base, unless the model marks its links itself. The world is a base body only where `base` names it.
 
@@ -56,15 +65,17 @@ def read_chain(model: mujoco.MjModel, base: str | None = None, tip: Tip = None, 
             joints.append(_joint(model, joint_id, name, axis, anchor, velocities.get(joint_id, np.inf)))
         links += _site_links(model, data, body, len(joints) - 1, in_base, paths)
     _check_names(joints)
+    ends = _chain_ends(model, data, chain_ids, hand)
+    hands = tuple(Hand(in_base(end.point), R_base_world @ end.rotation, path[-1])
+                  for end, path in zip(ends, paths, strict=True))  # fmt: skip
     if not links:
         has_base = base_segment and (base is not None or chain_ids.base != _WORLD)
-        ends = zip(chain_ids.chains, chain_ids.tips, strict=True)
-        tips = [in_base(_chain_end(model, data, chain[-1], name).point) for chain, name in ends]
+        tips = [found.position for found in hands]
         links = (_base_links(joints, paths) if has_base else []) + _anchor_links(joints, paths, tips)
     if len(paths) == 1:
-        return with_hands_along_links(Chain(tuple(joints), drop_zero_length(links)))
+        return Chain(tuple(joints), drop_zero_length(links), hands=hands)
     parents = tuple(_parent(joint, paths) for joint in range(len(joints)))
-    return with_hands_along_links(Chain(tuple(joints), drop_zero_length(links), parents, chain_ids.names))
+    return Chain(tuple(joints), drop_zero_length(links), parents, chain_ids.names, hands)
 
 
 def _check_names(joints: Sequence[Joint]) -> None:
@@ -162,20 +173,26 @@ def _link_name(pair: tuple[int, int], pairs: Sequence[tuple[int, int]], joints: 
     return joints[joint].name + (f"-{joints[following].name if following >= 0 else 'tip'}" if branches else "")
 
 
-def _chain_end(model: mujoco.MjModel, data: mujoco.MjData, joint: int, tip: str | None) -> ArmEnd:
-    """End of the last link of a chain: the named tip, or what `find_end` finds distal of its last joint."""
-    if tip is None:
-        return find_end(model, data, joint)
-    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)
-    point = data.site_xpos[site] if site >= 0 else data.xpos[tip_body(model, tip)]
-    return ArmEnd(point, f"{'site' if site >= 0 else 'body'} {tip!r}, as tip= says")
+def chain_ends(
+    model: mujoco.MjModel, base: str | None = None, tip: Tip = None, hand: HandChoice = None
+) -> tuple[ArmEnd, ...]:
+    """The end of each chain of an arm, in the world of the model in the zero pose; see `read_chain`."""
+    return _chain_ends(model, data_at_zero(model), find_chain(model, base, tip), hand)
 
 
-def chain_ends(model: mujoco.MjModel, base: str | None = None, tip: Tip = None) -> tuple[str, ...]:
-    """What each chain of an arm ends at, in words; see `find_chain`."""
-    chain_ids, data = find_chain(model, base, tip), data_at_zero(model)
-    ends = zip(chain_ids.chains, chain_ids.tips, strict=True)
-    return tuple(_chain_end(model, data, chain[-1], name).reason for chain, name in ends)
+def _chain_ends(
+    model: mujoco.MjModel, data: mujoco.MjData, chain_ids: ChainIds, hand: HandChoice
+) -> tuple[ArmEnd, ...]:
+    """The given ends of the chains, or those at the named tips, or those that `find_end` finds."""
+    if hand is not None:
+        return given_ends(model, data, [chain[-1] for chain in chain_ids.chains], hand)
+    ends = []
+    for chain, name in zip(chain_ids.chains, chain_ids.tips, strict=True):
+        body, paths = int(model.jnt_bodyid[chain[-1]]), [[0]] * len(chain_ids.chains)
+        marks = _site_links(model, data, body, 0, lambda point: point, paths)
+        tip = find_frame(model, data, name) if name is not None else None
+        ends.append(find_end(model, data, chain, tip=tip, marked=marks[-1].end if marks else None))
+    return tuple(ends)
 
 
 def base_pose(model: mujoco.MjModel, base: str | None = None, tip: Tip = None) -> Float[np.ndarray, "4 4"]:

@@ -10,7 +10,10 @@ _TOOLS = (
     {"gripper", "frame"}, {"gripper", "center"}, {"tool"}, {"attachment"}, {"flange"},
 )  # fmt: skip
 _HANDS = ({"tip"}, {"hand"}, {"palm"}, {"gripper"}, {"end"})  # frames of a hand, which may be where it begins
-_SENSORS = {"camera", "cam", "optical", "sensor", "imu", "lidar", "laser", "depth", "light", "led", "marker", "tag"}
+_SENSORS = {
+    "camera", "cam", "optical", "sensor", "imu", "lidar", "laser", "depth", "range", "torque", "light", "led", "marker",
+    "tag",
+}  # fmt: skip
 _FINGERS = {"finger", "fingers", "jaw", "jaws", "claw", "thumb", "index", "pinky"}
 _GRIPPERS = {"gripper", "grip", "grasp", *_FINGERS}
 _MOVERS = {"moving", "mover", "movable", "prop"}  # of a gripper, if a link is called so
@@ -39,8 +42,8 @@ def tool_rank(name: str) -> int | None:
 
 
 def hand_rank(name: str) -> int | None:
-    """As `tool_rank`, for the names of hands and their parts."""
-    return _rank(name, _HANDS)
+    """As `tool_rank`, for the names of hands and their parts but fingers."""
+    return None if set(words(name)) & _FINGERS else _rank(name, _HANDS)
 
 
 def _rank(name: str, table: tuple[set[str], ...]) -> int | None:
@@ -75,10 +78,20 @@ def is_other_limb(joint: str, link: str) -> bool:
 
 
 def side(name: str) -> str:
-    """The side that a name tells, left or right; "" for none."""
+    """The side that a name tells first, left or right; "" for none."""
+    return next(iter(_sides(name)), "")
+
+
+def finger_side(name: str) -> str:
+    """The side of a finger within its hand, which its name tells last: `right_hand_l_finger` is left; "" for none."""
+    return (["", *_sides(name)])[-1]
+
+
+def _sides(name: str) -> list[str]:
+    sides = []
     for word in words(name):
-        if word in _SIDES:
-            return _SIDES[word]
-        if found := _SIDE.fullmatch(word):
-            return _SIDES[found[1] or found[2]]
-    return ""
+        if part := _SIDE.fullmatch(word):
+            sides.append(_SIDES[part[1] or part[2]])
+        elif word in _SIDES:
+            sides.append(_SIDES[word])
+    return sides

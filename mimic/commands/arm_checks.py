@@ -146,6 +146,7 @@ def warnings(config: ArmConfig, arm: Arm) -> Iterator[str]:
     outside = names[(embodiment.home < lower) | (embodiment.home > upper)]
     if outside.size:
         yield f"{_listed(outside)}: the start pose is outside the joint range; limits=hardware starts inside it"
+    yield from (f"the hand: {end.doubt}; learner.hand= sets it" for end in arm.ends if end.doubt)
 
 
 def stabilised(config: ArmConfig, arm: Arm, env: EnvConfig) -> tuple[ArmConfig, str]:

@@ -37,7 +37,7 @@ class Inspection:
 
     Attributes:
       joints, links: tables of the learner's joints and links, one entry for each row.
-      ends: what the learner's chains end at.
+      ends: where the learner's chains end, and its hand frames.
       ignored: elements of the model that are ignored.
       assumed: values that the model lacks.
       warnings: reasons why the learner may imitate badly.
@@ -103,7 +103,7 @@ def _inspect(
     return Inspection(
         joints=_joints(learner, config.learner, env),
         links=_links(expert, learner, env),
-        ends=list(learner.ends),
+        ends=[end.reason for end in learner.ends],
         ignored=list(learner.notes),
         assumed=list(arm_checks.assumptions(config.learner, learner)),
         warnings=[*arm_checks.warnings(config.learner, learner), *([reason] if reason else [])],

@@ -59,7 +59,7 @@ def test_the_last_link_ends_at_the_tool(case):
     content, length, reason = ENDS[case]
     lengths = load_mjcf(arm(content)).link_lengths.tolist()
     assert lengths == pytest.approx([1, 1, length] if length else [1, 1])
-    assert chain_ends(arm(content))[0].startswith(reason)
+    assert chain_ends(arm(content))[0].reason.startswith(reason)
 
 
 def test_meshes_do_not_move_the_end():

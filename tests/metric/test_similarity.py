@@ -96,7 +96,7 @@ def test_centre_line_is_where_mujoco_has_the_links():
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
     line, length = centre_line_table(panda(), qpos, samples=200), float(panda().chain_length)
-    np.testing.assert_allclose(line.hand_position * length, data.site("flange").xpos, atol=1e-6)
+    np.testing.assert_allclose(line.hand_position * length, data.site("tcp").xpos, atol=1e-6)
     # The middle of each link is the centre of its site; the nearest sample is within half an interval of it.
     for link in range(1, 8):
         nearest = np.linalg.norm(line.points * length - data.site(f"link{link}").xpos, axis=1).min()
