@@ -1,4 +1,4 @@
-"""An arm's model prepared for rendering: without its scene, and with shapes to draw."""
+"""An arm's model prepared for rendering: without its scene, and with shapes and hand frames to draw."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -9,13 +9,16 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.arm import ArmConfig, arm_spec, build_arm
-from mimic.arms.embodiment import Embodiment
+from mimic.arms.embodiment import Embodiment, load_mjcf
 from mimic.arms.kinematic_tree import ChainIds, find_chain
 from mimic.arms.link_match import Colour
 from mimic.arms.model_tree import ancestors
 from mimic.arms.mujoco_chain import base_pose, data_at_zero
 
 _THICKNESS, _COLOUR = 0.03, (0.55, 0.62, 0.70, 1.0)  # of links without geoms; fraction of the chain length
+_HAND_LENGTH, _HAND_THICKNESS = 0.07, 0.006  # of the lines of a hand frame; fractions of the chain length
+HAND_LINE, _HAND_LINES = "hand frame ", ("x", "y", "z", "finger", "other finger", "palm")  # names of geoms
+_FINGERS, _AXES = (0.1, 0.1, 0.1, 1.0), ((0.9, 0.15, 0.15, 1.0), (0.1, 0.65, 0.2, 1.0), (0.15, 0.3, 0.95, 1.0))
 _DARK = 0.4  # maximum channel of a dark colour
 _SCENE_ELEMENTS = ("keys", "equalities", "actuators", "sensors", "tendons", "excludes", "pairs", "lights", "cameras")
 
@@ -48,6 +51,7 @@ def visual_spec(
         for body in spec.bodies[1:]:
             if body.name in by_body:
                 _colour_geoms(spec, body, by_body[body.name])
+    _draw_hands(model, spec, config, chain_ids)
     return spec, base_pose(model, config.base, config.tip)
 
 
@@ -133,4 +137,24 @@ def _draw_chain(model: mujoco.MjModel, data: mujoco.MjData, spec: mujoco.MjSpec,
                 type=mujoco.mjtGeom.mjGEOM_CAPSULE,
                 fromto=np.concatenate([R_body_world @ (point - data.xpos[body]) for point in (start, end)]),
                 size=[_THICKNESS * sum(lengths), 0, 0], rgba=_COLOUR, contype=0, conaffinity=0, mass=0,
+            )  # fmt: skip
+
+
+def _draw_hands(model: mujoco.MjModel, spec: mujoco.MjSpec, config: ArmConfig, chain_ids: ChainIds) -> None:
+    """The axes of each hand frame (x red, y green, z blue), and a fork that opens along x and points along z."""
+    arm = load_mjcf(model, base=config.base, tip=config.tip, hand=config.hand)
+    data, length = data_at_zero(model), _HAND_LENGTH * float(arm.chain_length)
+    lines = [([0, 0, 0], axis, rgba) for axis, rgba in zip(np.eye(3), _AXES, strict=True)]
+    lines += [([side, 0, 0], [side, 0, 1], _FINGERS) for side in (-0.6, 0.6)] + [([-0.6, 0, 0], [0, 0, 0], _FINGERS)]
+    T_world_base = base_pose(model, config.base, config.tip)
+    hands = zip(arm.hand_joint, arm.hand_position, arm.hand_rotation, strict=True)
+    for number, (joint, position, rotation) in enumerate(hands):
+        body = int(model.jnt_bodyid[chain_ids.joints[joint]])
+        R_body_base = data.xmat[body].reshape(3, 3).T @ T_world_base[:3, :3]
+        origin = R_body_base @ position + data.xmat[body].reshape(3, 3).T @ (T_world_base[:3, 3] - data.xpos[body])
+        for name, (start, end, rgba) in zip(_HAND_LINES, lines, strict=True):
+            ends = [origin + length * R_body_base @ rotation @ np.asarray(point, float) for point in (start, end)]
+            spec.body(model.body(body).name).add_geom(
+                name=f"{HAND_LINE}{number} {name}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=np.concatenate(ends),
+                size=[_HAND_THICKNESS * float(arm.chain_length), 0, 0], rgba=rgba, contype=0, conaffinity=0, mass=0,
             )  # fmt: skip

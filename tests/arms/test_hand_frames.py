@@ -10,6 +10,7 @@ from mimic.arms.embodiment import load_mjcf, panda_path
 from mimic.arms.link_match import hand_poses
 from mimic.arms.mujoco_chain import base_pose, chain_ends
 from mimic.arms.names import finger_side
+from mimic.arms.visual_model import HAND_LINE, visual_spec
 from tests.helpers.original_model import package_file
 
 TO_X = 'euler="0 1.5707963267948966 0"'  # z along the world's x
@@ -251,3 +252,21 @@ def test_hands_move_as_in_mujoco_and_with_every_joint(name):
         for joint in range(len(names)):  # of the pair each arm moves its own hand
             moved = np.abs(hand_poses(arm.embodiment, qpos + 0.1 * np.eye(len(names))[joint]) - hands)
             assert (moved.max(axis=(1, 2)) > 0.01).sum() == 1
+
+
+@pytest.mark.parametrize("name", ["panda_pair", "planar"])
+def test_a_picture_has_the_hands_where_they_are(name):
+    config = ArmConfig(model=name, **PACKAGED[name])
+    arm = mimic.build_arm(config).embodiment
+    spec, T_world_base = visual_spec(config)
+    model = spec.compile()
+    data, qpos = mujoco.MjData(model), np.random.default_rng(0).uniform(-2, 2, arm.num_joints)
+    for joint, angle in zip(arm.joint_names, qpos, strict=True):
+        data.joint(joint).qpos[0] = angle
+    mujoco.mj_kinematics(model, data)
+    for number, pose in enumerate(T_world_base @ hand_poses(arm, qpos)):
+        for axis, letter in enumerate("xyz"):
+            line = data.geom(f"{HAND_LINE}{number} {letter}")  # from the hand along its axis
+            half = model.geom(line.id).size[1]
+            np.testing.assert_allclose(line.xpos, pose[:3, 3] + half * pose[:3, axis], atol=1e-9)
+            np.testing.assert_allclose(np.abs(line.xmat.reshape(3, 3)[:, 2] @ pose[:3, axis]), 1, atol=1e-9)

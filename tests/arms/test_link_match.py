@@ -7,7 +7,7 @@ import pytest
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.link_match import THRESHOLD, colours_along_arm, link_ends
-from mimic.arms.visual_model import body_links, is_dark, visual_spec
+from mimic.arms.visual_model import HAND_LINE, body_links, is_dark, visual_spec
 from mimic.metric.config import MetricConfig
 from mimic.metric.kinematics import link_states
 
@@ -53,7 +53,8 @@ def test_visible_parts_of_a_link_have_its_colour():
     links = body_links(model, config, "none")
     assert set(links.values()) == set(colours)
     for body, link in links.items():
-        rgba = [model.geom_rgba[geom] for geom in range(model.ngeom) if model.geom_bodyid[geom] == body]
+        geoms = [geom for geom in range(model.ngeom) if not model.geom(geom).name.startswith(HAND_LINE)]
+        rgba = [model.geom_rgba[geom] for geom in geoms if model.geom_bodyid[geom] == body]
         light = [colour for colour in rgba if not is_dark(colour)] or rgba
         np.testing.assert_allclose(light, [(*colours[link], 1.0)] * len(light), atol=1e-6)
 
