@@ -28,6 +28,7 @@ _SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1,
           "capsule": {"radius": 1, "length": 1}}  # fmt: skip
 _MAX_MASS, _MAX_INERTIA = MAX_VALUES["mass [kg]"][0], MAX_VALUES["inertia [kg m^2]"][0]
 _MAX_RANGE, _MAX_TORQUE = MAX_VALUES["joint range [rad or m]"][0], MAX_VALUES["torque limit [N m]"][0]
+_MANY_TURNS = 50.0  # rad: ranges that are stated in degrees are beyond it, those of winches and wheels too
 _MAX_NAMES = 6  # in a line
 _EXPRESSION = re.compile(r"\$[{(]")
 _TEMPLATES = {"include", "macro", "property", "arg", "if", "unless"}  # elements of xacro that make a file a template
@@ -248,7 +249,8 @@ def _mend_limits(joints: Iterable[_Element]) -> dict[str, list[str]]:
     swapped = "lower limit above the upper one in {}: swapped"
     none = "no range of angles in {}: a full turn is assumed"
     one_sided = "one limit alone is stated in {}: 0 is the other one, as URDF defines it"
-    changed: dict[str, list[str]] = {swapped: [], none: [], one_sided: []}
+    wide = f"limits beyond {_MANY_TURNS:g} in {{}}: read as rad, as URDF defines them, and not as degrees"
+    changed: dict[str, list[str]] = {swapped: [], none: [], one_sided: [], wide: []}
     for joint in (joint for joint in joints if joint.get("type") in ("revolute", "prismatic")):
         name, limit = joint.get("name", ""), joint.find("limit")
         if limit is None:
@@ -262,6 +264,8 @@ def _mend_limits(joints: Iterable[_Element]) -> dict[str, list[str]]:
                 joint.set("type", "continuous")
                 changed[none].append(name)
             continue
+        if joint.get("type") == "revolute" and max(map(abs, ends)) > _MANY_TURNS:
+            changed[wide].append(name)
         if is_one_sided or ends[0] > ends[1]:
             limit.set("lower", repr(min(ends)))
             limit.set("upper", repr(max(ends)))

@@ -268,7 +268,7 @@ class RecordingConfig:
       topic: topic or feature of `source` that has the joints, where several do; see `import_demonstrations`.
       units: of the angles in `source`: rad, deg or percent. Default "": stated there or found, see
         `import_demonstrations`.
-      rate: samples per second of HDF5 files in `source`. Default None: stated there.
+      rate: samples per second of a table or of HDF5 files in `source`. Default None: stated there.
       arm: "left" or "right" arm of the person in a motion capture file `source`, or "both". Default "": right.
       capture: how such a file is read and cut.
       out: .npz file of the demonstrations; must not exist.

@@ -114,7 +114,7 @@ def read_recording(
       topic: topic of a rosbag2, feature of a LeRobot dataset, or data set of an HDF5 file; only needed where several
         have the joints.
       units: "rad", "deg" or "percent" of each joint's range; where empty, what the source states, or what is found.
-      rate: samples per second, of HDF5 files that do not state it.
+      rate: samples per second, of tables and HDF5 files that do not state it.
       joint_range: of the arm's model [rad], where the arm itself has wider ones, as with limits=none.
 
     Raises:
@@ -166,8 +166,8 @@ def _read(source: Path, names: Sequence[str], topic: str, rate: float | None) ->
         return read_rosbag2(source, names, topic)
     if is_hdf5(source):
         return read_hdf5(source, names, topic, rate)
-    if rate:
-        raise ValueError(f"rate: expected only for HDF5 files, got {rate:g} for {str(source)!r}")
+    if rate and not source.name.endswith(TABLES):
+        raise ValueError(f"rate: expected only for tables and HDF5 files, got {rate:g} for {str(source)!r}")
     if topic:
         raise ValueError(
             f"topic: expected only for a LeRobot dataset, a rosbag2 or HDF5 files, got {topic!r} for {str(source)!r}"
@@ -182,7 +182,7 @@ def _read(source: Path, names: Sequence[str], topic: str, rate: float | None) ->
         raise ValueError(f"source: no file at {str(source)!r}")
     if not source.name.endswith(SOURCES):
         raise ValueError(f"source: expected a file that ends in {', '.join(SOURCES)}, got {str(source)!r}")
-    return (read_table if source.name.endswith(TABLES) else read_archive)(source, names)
+    return read_table(source, names, rate) if source.name.endswith(TABLES) else read_archive(source, names)
 
 
 def _window_starts(length: float, duration: float) -> np.ndarray:

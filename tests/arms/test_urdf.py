@@ -94,12 +94,14 @@ def test_each_change_is_a_line_that_names_it(read, caplog):
         ('lower="-2.5" upper="2.5" effort="38"', 'lower="1" upper="-1" effort="38"'),
         ('lower="-2.5" upper="2.5" effort="37"', 'lower="0" upper="0" effort="37"'),
         ('lower="-2.5" upper="2.5" effort="36"', 'lower="-1" effort="36"'),
+        ('lower="-2.5" upper="2.5" effort="39"', 'lower="-170" upper="170" effort="39"'),
     )
     for line in (
         "corrected the inertia of l1, which no body has, to the nearest physical one",
         "lower limit above the upper one in j2: swapped",
         "no range of angles in j3: a full turn is assumed",
         "one limit alone is stated in j4: 0 is the other one",
+        "limits beyond 50 in j1: read as rad, as URDF defines them, and not as degrees",
     ):
         assert line in caplog.text, caplog.text
     assert "equal lower and upper" not in caplog.text  # MuJoCo's warning
@@ -211,6 +213,11 @@ def test_a_template_gets_a_line_that_says_how_to_expand_it(tmp_path, text):
     (tmp_path / "arm.urdf").write_text(text)
     with pytest.raises(ValueError, match="is a xacro, a template of a URDF; expand it first, with `xacro FILE"):
         mimic.load_mjcf(tmp_path / "arm.urdf")
+
+
+def test_a_namespace_of_all_elements_is_no_obstacle(read):
+    arm, _ = read(('<robot name="four"', "<robot xmlns='http://drake.mit.edu' name=\"four\""))
+    assert arm.num_joints == 4
 
 
 def test_an_expanded_file_may_keep_calls_of_macros(read):

@@ -124,7 +124,7 @@ def test_joint_names_of_the_file_can_be_given(tmp_path):
         (lambda path: table(path, names=NUMBERED, time=TIME[:100]), [], "lasts 1.98 s, but an episode 5 s"),
         (lambda path: table(path, names=NUMBERED, time=TIME[::-1]), [], "at times that increase"),
         (lambda path: table(path, names=NUMBERED, factor=16.0, time=TIME), ["limits=none"], "has a velocity of"),
-        (lambda path: path.write_text("time,q_1\n0,a\n"), [], "is no table of numbers below a header"),
+        (lambda path: path.write_text("time,q_1\n0,a\n1,2\n"), [], "is no table of numbers below a header"),
         (lambda path: table(path, names=NUMBERED), ["kind=reach"], "kind: expected none with source=FILE"),
         (lambda path: table(path, names=NUMBERED), ["joints=[a]"], "joints: expected 7 names"),
     ],

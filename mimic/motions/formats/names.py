@@ -22,6 +22,9 @@ SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "
 _BRACKETS = re.compile(r"(.+?)\s*[\[(](.+?)[\])]")
 _LAST, _FIRST = re.compile(r"(.+)[./_ ]([^./_ ]+)"), re.compile(r"([a-z]+)[./_ ]?(.+)", re.IGNORECASE)
 _LEAF = re.compile(r"(|.*[./])([^./]+)")
+_NUMBERED = re.compile(r"([a-z]+)[./_ ]([a-z]+)[./_ ]?(\d+)", re.IGNORECASE)
+_WHOSE = "actual", "measured", "target", "desired", "commanded", "command", "joint", "robot"  # before a quantity's word
+_COUNTED = re.compile(rf"((?:{'|'.join(_WHOSE)}|motor|servo|axis|dof|[ajq])*)(\d+)")
 _BY_ORDER = "by their order"
 _GRIPPER = re.compile(r"gripper|finger|jaw|knuckle", re.IGNORECASE)
 
@@ -59,7 +62,7 @@ class Selection(NamedTuple):
 
 
 def parse_column(text: str) -> Column:
-    """Splits the name of a column, as in `joint1.pos`, `qdot_joint1`, `q1`, `elbow [deg]` or `/arm/elbow/velocity`."""
+    """Splits the name of a column: `joint1.pos`, `qdot_joint1`, `q1`, `actual_q_0`, `elbow [deg]`, `/arm/elbow/velocity`."""
     name, unit = text.strip(), ""
     if match := _BRACKETS.fullmatch(name):
         name, stated = match[1], match[2].strip().lower()
@@ -70,6 +73,8 @@ def parse_column(text: str) -> Column:
         return Column(match[1], QUANTITIES[match[2].lower()], unit)
     if (match := _FIRST.fullmatch(name)) and match[1].lower() in QUANTITIES:
         return Column(match[2], QUANTITIES[match[1].lower()], unit)
+    if (match := _NUMBERED.fullmatch(name)) and match[1].lower() in _WHOSE and match[2].lower() in QUANTITIES:
+        return Column(f"{match[1]} {match[3]}", QUANTITIES[match[2].lower()], unit)
     return Column(name, ANGLE, unit)
 
 
@@ -77,7 +82,7 @@ def find_joints(present: Sequence[str], joints: Sequence[str]) -> tuple[list[str
     """The names in a source that belong to joints of an arm, base to tip, and the rule that found them.
 
     The names are equal; or equal but for case and separators (`joint_1`, `Joint1`); or the source's have one prefix
-    (`panda_joint1`), or the arm's; or the source counts the joints from 1. None where no rule finds all, or where
+    (`panda_joint1`), or the arm's; or the source counts the joints from 0 or 1. None where no rule finds all, or where
     several prefixes fit, as in a source with two arms.
     """
     if set(joints) <= set(present):
@@ -93,14 +98,29 @@ def find_joints(present: Sequence[str], joints: Sequence[str]) -> tuple[list[str
         return [by_key[prefix + key] for key in keys], "by name"
     if fitting:
         return None
-    numbers = [str(number) for number in range(1, len(joints) + 1)]
-    if set(numbers) <= set(by_key):
-        return [by_key[number] for number in numbers], _BY_ORDER
+    counted = _counted(by_key, len(joints))
+    measured = [prefix for prefix in counted if not is_command(prefix)] or list(counted)
+    if measured:
+        return (counted[measured[0]], _BY_ORDER) if len(measured) == 1 else None
     shared = next((n for n, letters in enumerate(zip(*keys, strict=False)) if len(set(letters)) > 1), 0)
     for cut in range(1, shared + 1):
         if all(key[cut:] in by_key for key in keys):
             return [by_key[key[cut:]] for key in keys], "by name"
     return None
+
+
+def _counted(by_key: Mapping[str, str], count: int) -> dict[str, list[str]]:
+    """Names that number joints from 0 or 1, by what is before the number: as many as an arm has, or more if bare."""
+    groups: dict[str, dict[int, str]] = {}
+    for key, name in by_key.items():
+        if match := _COUNTED.fullmatch(key):
+            groups.setdefault(match[1], {})[int(match[2])] = name
+    fitting = {prefix: names for prefix, names in groups.items() if len(names) == count or not prefix}
+    numbers = {prefix: range(min(names), min(names) + count) for prefix, names in fitting.items()}
+    return {
+        prefix: [names[number] for number in numbers[prefix]]
+        for prefix, names in fitting.items() if min(names) < 2 and set(numbers[prefix]) <= set(names)
+    }  # fmt: skip
 
 
 def select(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str], entry: str, kind: str) -> Selection:

@@ -1,9 +1,11 @@
 """Reads joint motions from tables of text: CSV, TSV, and a folder with a table for each quantity."""
 
 import gzip
+import math
 import re
 import zlib
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +21,18 @@ _CLOCKS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # units of times that larg
 _SLOWEST = 0.99  # s between samples: with more, they are in another unit, or no motion
 
 
-def read_table(path: Path, joints: Sequence[str]) -> Recording:
+def read_table(path: Path, joints: Sequence[str], rate: float | None = None) -> Recording:
     """The motions of joints, one for each number in the column `demonstration`.
 
-    Cells are separated by commas, semicolons, tabs or blanks; with semicolons a comma may be the decimal point. A
+    Cells are separated by commas, semicolons, tabs or blanks; a comma that separates none is a decimal point. A
     header has the columns `time` and, for each joint, its angle: its name, `q_NAME`, `NAME.pos` or `q_1`, `q_2`, ...
     by number; and optionally velocities, as `qdot_NAME`. Units may follow, as in `elbow [deg]`. Without a header the
     columns are time, angles, and optionally velocities, of all joints in their order.
+
+    Args:
+      path: the table.
+      joints: names of the joints, base to tip.
+      rate: samples per second, where the table does not state times, or others.
 
     Raises:
       ValueError: no table of numbers, or one that lacks columns.
@@ -33,7 +40,7 @@ def read_table(path: Path, joints: Sequence[str]) -> Recording:
     header, table = _read_cells(path)
     columns, notes = [parse_column(name) for name in header], []
     if not header:
-        columns, notes = _default_columns(path, table.shape[1], len(joints))
+        columns, notes = _default_columns(path, table.shape[1], len(joints), not rate)
     names = {
         quantity: {column.joint: i for i, column in enumerate(columns) if column.quantity == quantity}
         for quantity in (ANGLE, VELOCITY)
@@ -44,13 +51,19 @@ def read_table(path: Path, joints: Sequence[str]) -> Recording:
     )
     reserved = [column.joint for i, column in enumerate(columns) if i in (time_at, number_at)]
     angles = {name: index for name, index in names[ANGLE].items() if name not in reserved}
-    if time_at is None:
-        raise ValueError(f"source: {str(path)!r} lacks time; got the columns {', '.join(header)}")
+    if time_at is None and not rate:
+        raise ValueError(
+            f"source: {str(path)!r} lacks time; got the columns {', '.join(header)}; rate= states samples per second"
+        )
     if not len(table):
         raise ValueError(f"source: {str(path)!r} has no rows")
     selection = select(str(path), {"columns": list(angles)}, joints, "", "table")
-    unit = columns[time_at].unit or re.split(r"[^a-zµ]+", columns[time_at].joint.lower())[-1]
-    time, line = seconds(path, table[:, time_at], unit if unit in SECONDS else columns[time_at].unit)
+    if words := [name for name in selection.joints if not np.isfinite(table[:, angles[name]]).any()]:
+        raise ValueError(f"source: {str(path)!r} has no number in the column of {words[0]}")
+    time, line = np.arange(len(table)) / (rate or 1), ""
+    if time_at is not None and not rate:
+        unit = columns[time_at].unit or re.split(r"[^a-zµ]+", columns[time_at].joint.lower())[-1]
+        time, line = seconds(path, table[:, time_at], unit if unit in SECONDS else columns[time_at].unit)
     qvel = _velocities(path, table, names[VELOCITY], selection)
     gripper = table[:, [angles[name] for name in selection.gripper]] if selection.gripper else None
     motion = Motion(time, table[:, [angles[name] for name in selection.joints]], qvel, gripper)
@@ -127,11 +140,36 @@ def _read_cells(path: Path) -> tuple[list[str], np.ndarray]:
 
 
 def _numbers(rows: list[str], separator: str | None) -> np.ndarray:
-    """The numbers in rows; the faster way does not know empty cells, quotes and decimal commas."""
+    """The numbers in rows; the faster way does not know empty cells, quotes, decimal commas, dates and words.
+
+    Raises:
+      ValueError: rows of other lengths, or a word among the numbers of a column.
+    """
     try:
         return np.loadtxt(rows, delimiter=separator, comments=None, ndmin=2) if rows else np.zeros((0, 0))
     except ValueError:
-        return np.array([[_number(cell, separator) for cell in _cells(row, separator)] for row in rows], float)
+        table = [_cells(row, separator) for row in rows]
+    for number, row in enumerate(table, start=1):
+        if len(row) != len(table[0]):
+            raise ValueError(f"row {number} has {len(row)} cells, expected {len(table[0])}")
+    return np.stack([_column(cells, separator) for cells in zip(*table, strict=True)], axis=1)
+
+
+def _column(cells: Sequence[str], separator: str | None) -> np.ndarray:
+    """The numbers in a column: dates as seconds since 1970, and NaN for empty cells and where all are words."""
+    values = [_number(cell, separator) for cell in cells]
+    numbers = np.array([math.nan if value is None else value for value in values])
+    if words := [cell for cell, value in zip(cells, values, strict=True) if value is None]:
+        if len(words) + cells.count("") < len(cells):
+            raise ValueError(f"expected a number, got {words[0]!r:.40}")
+        try:
+            dates = [datetime.fromisoformat(word) for word in words]
+        except ValueError:
+            return numbers
+        numbers[[value is None for value in values]] = [
+            date.replace(tzinfo=date.tzinfo or UTC).timestamp() for date in dates
+        ]
+    return numbers
 
 
 def _text(path: Path) -> str:
@@ -148,27 +186,30 @@ def _cells(line: str, separator: str | None) -> list[str]:
     return [cell.strip().strip('"').strip() for cell in line.split(separator)]
 
 
-def _number(cell: str, separator: str | None) -> float:
-    return float((cell.replace(",", ".") if separator == ";" else cell) or "nan")
+def _number(cell: str, separator: str | None) -> float | None:
+    """The number in a cell, NaN in an empty one; None for a word."""
+    try:
+        return float((cell if separator == "," else cell.replace(",", ".")) or "nan")
+    except ValueError:
+        return None
 
 
 def _are_numbers(cells: Sequence[str], separator: str | None) -> bool:
-    try:
-        return bool([_number(cell, separator) for cell in cells])
-    except ValueError:
-        return False
+    return None not in [_number(cell, separator) for cell in cells]
 
 
-def _default_columns(path: Path, count: int, joints: int) -> tuple[list[Column], list[str]]:
+def _default_columns(path: Path, count: int, joints: int, timed: bool) -> tuple[list[Column], list[str]]:
     """The columns of a table without a header: time, angles, and as many velocities and torques as there are."""
     blocks = {1: "angles", 2: "angles and velocities", 3: "angles, velocities and torques"}
-    if (count - 1) % joints or (count - 1) // joints not in blocks:
+    quantities = blocks.get((count - timed) // joints)
+    if (count - timed) % joints or not quantities:
         raise ValueError(
             f"source: {str(path)!r} has no header and {count} columns; expected time and the angles of {joints} "
-            f"joints, optionally their velocities: {joints + 1} or {2 * joints + 1} columns"
+            f"joints, optionally their velocities: {joints + 1} or {2 * joints + 1} columns, or one less and rate="
         )
-    names = ["time", *(f"{word}_{number + 1}" for word in ("q", "dq", "tau") for number in range(joints))]
-    note = f"no header: the columns are time, then the {blocks[(count - 1) // joints]} of {joints} joints"
+    names = [f"{word}_{number + 1}" for word in ("q", "dq", "tau") for number in range(joints)]
+    names = ["time", *names] if timed else names
+    note = f"no header: the columns are {'time, then ' * timed}the {quantities} of {joints} joints"
     return [parse_column(name) for name in names[:count]], [note]
 
 

@@ -20,6 +20,7 @@ from mimic.motions.formats.names import find_joints, parse_column, select
         ("elbow_velocity (rad/s)", ("elbow", VELOCITY, "rad")),
         ("left_arm_joint_1_rad", ("left_arm_joint_1", ANGLE, "rad")),
         ("tau_2", ("2", TORQUE, "")),
+        ("actual_qd_0", ("actual 0", VELOCITY, "")),
         ("wrist_angle", ("wrist_angle", ANGLE, "")),
         ("time [ms]", ("time", ANGLE, "ms")),
     ],
@@ -32,6 +33,9 @@ def test_columns(text, expected):
     ("present", "joints", "expected"),
     [
         (["x", "b", "a"], ["a", "b"], ["a", "b"]),
+        (["motor_0", "motor_1", "gripper"], ["shoulder", "elbow"], ["motor_0", "motor_1"]),
+        (["target 0", "target 1", "actual 0", "actual 1"], ["shoulder", "elbow"], ["actual 0", "actual 1"]),
+        (["joint_0", "joint_1", "joint_2"], ["shoulder", "elbow"], None),
         (["joint_1", "joint_2", "gripper"], ["joint1", "joint2"], ["joint_1", "joint_2"]),
         (
             ["panda_joint1", "panda_joint2", "panda_finger_joint1"],

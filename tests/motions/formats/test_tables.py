@@ -38,6 +38,13 @@ SPELLINGS = {
     "a clock": text(["timestamp", *HEADER[1:]], 1_700_000_000_000 + 1000 * TIME, QPOS, QVEL),
     "PlotJuggler": text(["__time", *(f"/js/{name}/{what}" for what in ("position", "velocity") for name in JOINTS)],
                         1.7e9 + TIME, QPOS, QVEL),
+    "a robot's own log": text(["timestamp", *(f"{what}_{i}" for what in ("target_q", "actual_q", "actual_qd") for i in (0, 1))],
+                              TIME, QPOS + 0.01, QPOS, QVEL, separator=" "),
+    "words and dates": "stamp,frame_id,shoulder,elbow,qdot_shoulder,qdot_elbow\n" + "".join(
+        f"2024-05-01T12:00:0{row[0]:.6f}Z,base,{','.join(f'{value:.6f}' for value in row[1:])}\n"
+        for row in np.column_stack([TIME, QPOS, QVEL])
+    ),
+    "decimal commas between tabs": text(HEADER, TIME, QPOS, QVEL, separator="\t", decimal=","),
     "other columns": text(["frame", *HEADER, "force_x"], 50 * TIME, TIME, QPOS, QVEL, 9 + TIME),
 }  # fmt: skip
 
@@ -49,6 +56,14 @@ def test_tables_are_read(tmp_path, spelling):
     np.testing.assert_allclose(motion.qpos, QPOS, atol=1e-12)
     assert motion.qvel is not None
     np.testing.assert_allclose(motion.qvel, QVEL, atol=1e-12)
+
+
+@pytest.mark.parametrize("header", [[], list(JOINTS)])
+def test_a_table_without_times_needs_a_rate(tmp_path, header):
+    (tmp_path / "table.csv").write_text(text(header, QPOS))
+    (motion,) = read_table(tmp_path / "table.csv", JOINTS, rate=50).motions.values()
+    np.testing.assert_allclose(motion.time, TIME, atol=1e-12)
+    np.testing.assert_allclose(motion.qpos, QPOS, atol=1e-12)
 
 
 def test_assumptions_about_a_table_are_lines(tmp_path):
@@ -84,8 +99,9 @@ def test_a_packed_folder_with_a_table_for_each_quantity(tmp_path):
     ("content", "message"),
     [
         ("", "is no table of numbers below a header: it has no rows"),
-        ("time,shoulder,elbow\n0,1,x\n", "could not convert string to float: 'x'"),
-        ("time,shoulder,elbow\n0,1,2\n0,1\n", "inhomogeneous"),
+        ("time,shoulder,elbow\n0,1,x\n", "has no number in the column of elbow"),
+        ("time,shoulder,elbow\n0,1,x\n1,1,2\n", "expected a number, got 'x'"),
+        ("time,shoulder,elbow\n0,1,2\n0,1\n", "row 2 has 2 cells, expected 3"),
         ("time,shoulder,elbow\n", "has no rows"),
         ("shoulder,elbow\n1,2\n", "lacks time; got the columns shoulder, elbow"),
         ("time,shoulder\n1,2\n", "has no table with the joints shoulder, elbow; its joint angles: columns .shoulder"),
