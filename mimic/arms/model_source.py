@@ -22,7 +22,7 @@ MAX_ELEMENTS = 100_000  # XML elements
 _PACKAGE_LEVELS = 4  # folders above a URDF in which its ROS package may be
 
 _PACKAGE = re.compile(r"package:/+([^/]+)/(.*)", re.DOTALL)
-_COMMENT = re.compile(r"""<!--.*?(?:-->|\Z)|\sxmlns=(?:"[^"]*"|'[^']*')""", re.DOTALL)  # or the namespace of all elements
+_COMMENT = re.compile(r"""<!--.*?(?:-->|\Z)|\sxmlns=(?:"[^"]*"|'[^']*')""", re.DOTALL)  # or all elements' namespace
 _TAG = re.compile(r"<[^<>]*>")
 _MESH_FORMATS = (".stl", ".obj", ".msh")
 

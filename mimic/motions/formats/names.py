@@ -62,7 +62,7 @@ class Selection(NamedTuple):
 
 
 def parse_column(text: str) -> Column:
-    """Splits the name of a column: `joint1.pos`, `qdot_joint1`, `q1`, `actual_q_0`, `elbow [deg]`, `/arm/elbow/velocity`."""
+    """Splits a column's name: `joint1.pos`, `qdot_joint1`, `q1`, `actual_q_0`, `elbow [deg]`, `/arm/elbow/velocity`."""
     name, unit = text.strip(), ""
     if match := _BRACKETS.fullmatch(name):
         name, stated = match[1], match[2].strip().lower()

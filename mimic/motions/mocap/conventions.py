@@ -16,6 +16,7 @@ STATED_ARM_LENGTH = 0.3, 0.9  # m, also of children: where a file states the uni
 # Of what speaks for an axis as up.
 _WEIGHTS = {"usual": 1.5, "stated": 3.0, "body": 2.0, "unlikely": 1.0, "floor": 2.0, "rest": 1.0}
 _LIKELY = ("y", "z", "-y")  # axes that point up; -y in the frame of a camera
+_LEANING = 0.8  # cosine of the angle between a body and an axis, below which it is along none
 _HIGH = {"head": ("head",), "neck": ("neck",), "shoulders": ("shoulder",), "arms": ("upper_arm",)}
 _LOW = {"feet": ("foot",), "toes": ("toe",), "hips": ("hip",), "knees": ("knee",)}
 _FLOOR = -0.04, 0.1, 0.04  # of the body's size: height of its lowest point at least and at most, and mean height
@@ -55,8 +56,8 @@ def find_up(motion: PointMotion, usual: str, stated: str = "", rest: np.ndarray 
     """The axis that points up, and how it was found.
 
     What speaks for an axis is weighed: the body stands along it, its lowest points are at 0, the skeleton at rest
-    stands along it, the file states it, and it is usual. A person may lie or stand on the hands: a body along an axis
-    that is hardly ever up counts less.
+    stands along it, the file states it, and it is usual. A person may lie, lean or stand on the hands: a body along an
+    axis that is hardly ever up, or far from all axes, counts less.
 
     Args:
       motion: the points, in the file's axes.
@@ -66,9 +67,10 @@ def find_up(motion: PointMotion, usual: str, stated: str = "", rest: np.ndarray 
     """
     votes: dict[str, float] = dict.fromkeys(UPS, 0.0)
     votes[usual] += _WEIGHTS["usual"]
-    body, how = _body_axis(motion)
+    body, how, is_along = _body_axis(motion)
+    is_likely = is_along and body in _LIKELY and body != f"-{usual}"
     evidence = {"stated": stated, "floor": _floor_axis(motion, (body, stated, usual)) if "feet" in how else ""}
-    evidence["body" if body in _LIKELY and body != f"-{usual}" else "unlikely"] = body
+    evidence["body" if is_likely else "unlikely"] = body
     if rest is not None:
         evidence["rest"] = _body_axis(dataclasses.replace(motion, positions=rest[None]))[0]
     for kind, axis in evidence.items():
@@ -76,7 +78,8 @@ def find_up(motion: PointMotion, usual: str, stated: str = "", rest: np.ndarray 
             votes[axis] += _WEIGHTS[kind]
     up = max(votes, key=votes.__getitem__)
     if up == body:
-        return up, how if not stated or stated == up else f"{how}, though the file states {stated}"
+        guess = "" if is_likely or stated == up else ": a guess, capture.up= sets it"
+        return up, (how if not stated or stated == up else f"{how}, though the file states {stated}") + guess
     reason = {stated: "as the file states", usual: "as usual for such files"}.get(up, "from the floor")
     if body:
         return up, f"{reason}, though the body is along {body}: a guess, capture.up= sets it"
@@ -96,8 +99,8 @@ def looks_mirrored(motion: PointMotion, facing: dict[str, tuple[str, ...]]) -> b
     return len(cosine) > 0 and bool(np.median(cosine) < _BACKWARDS)
 
 
-def _body_axis(motion: PointMotion) -> tuple[str, str]:
-    """The axis along the body, and between which parts; "" where too little was seen, or nothing is along an axis."""
+def _body_axis(motion: PointMotion) -> tuple[str, str, bool]:
+    """The axis along the body, between which parts, and whether these lie along it; "" where too little was seen."""
     for (high, high_parts), (low, low_parts) in itertools.product(_HIGH.items(), _LOW.items()):
         top, bottom = _mean_of(motion, high_parts), _mean_of(motion, low_parts)
         if top is None or bottom is None:
@@ -107,8 +110,9 @@ def _body_axis(motion: PointMotion) -> tuple[str, str]:
         if len(body) and np.all(length > 0):
             mean = (body / length).mean(axis=0)
             axis = int(np.argmax(np.abs(mean)))
-            return f"{'-' if mean[axis] < 0 else ''}{'xyz'[axis]}", f"from the {low} to the {high}"
-    return "", ""
+            name, is_along = f"{'-' if mean[axis] < 0 else ''}{'xyz'[axis]}", abs(mean[axis]) > _LEANING
+            return name, f"from the {low} to the {high}", bool(is_along)
+    return "", "", False
 
 
 def _mean_of(motion: PointMotion, parts: tuple[str, ...]) -> np.ndarray | None:

@@ -17,10 +17,11 @@ from mimic.motions.mocap.conventions import (
     find_up,
     guessed_units,
     looks_mirrored,
+    mean_point,
     z_up,
 )
 from mimic.motions.mocap.names import parts_of
-from mimic.motions.mocap.points import ArmPoints, PointMotion
+from mimic.motions.mocap.points import ArmPoints, PointMotion, median_length
 from mimic.motions.mocap.tables import Table, read_csv, read_npz, read_trc
 
 KINDS = (".bvh", ".c3d", ".trc", ".csv", ".npz")
@@ -36,6 +37,7 @@ _SYNONYMS = {
     "in": "inch",
     "ft": "foot",
 }
+_STRETCH = 0.3  # of a length: no arm changes by more
 _UP = {".bvh": "y", ".trc": "y", ".c3d": "z", ".csv": "z", ".npz": "z"}  # where neither file nor body says
 
 
@@ -77,7 +79,7 @@ def read_motion(
             rest = None if table.rest is None else table.rest[[table.names.index(name) for name in motion.names]]
             up, how = find_up(motion, _UP[suffix], _stated(table.up, UPS), rest)
             motion = _noted(motion, f"up: {up}, {how}")
-        return _in_metres_z_up(motion, unit or stated, up)
+        return _without_stretched(_in_metres_z_up(motion, unit or stated, up))
     except (ValueError, OSError) as error:
         raise ValueError(f"source: {str(source)!r}: {error}") from error
 
@@ -214,6 +216,24 @@ def _full_name(motion: PointMotion, name: str) -> str:
     """A point by its name, also without a prefix that ends in a colon."""
     full = [point for point in motion.names if point.split(":")[-1] == name]
     return full[0] if name not in motion.names and len(full) == 1 else motion.names[motion.index(name)]
+
+
+def _without_stretched(motion: PointMotion) -> PointMotion:
+    """The motion without the elbows and wrists that are too far from the joint before: exchanged or frozen markers."""
+    positions, wrong = motion.positions.copy(), np.zeros(len(motion.positions), bool)
+    for arm in find_arms(motion).values():
+        for proximal, distal in ((arm.shoulder, arm.elbow), (arm.elbow, arm.wrist)):
+            span = mean_point(motion, distal) - mean_point(motion, proximal)
+            usual = median_length(span)
+            is_wrong = np.abs(np.linalg.norm(span, axis=1) - usual) > _STRETCH * usual
+            positions[np.ix_(is_wrong, [motion.index(name) for name in distal])] = np.nan
+            wrong |= is_wrong
+    if not wrong.any():
+        return motion
+    note = (
+        f"left out: {wrong.sum()} samples at which an arm's length differs by more than {_STRETCH:.0%} from its usual"
+    )
+    return _noted(dataclasses.replace(motion, positions=positions), f"{note} one; markers may be exchanged or frozen")
 
 
 def _in_metres_z_up(motion: PointMotion, unit: str, up: str) -> PointMotion:

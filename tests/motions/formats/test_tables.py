@@ -38,8 +38,8 @@ SPELLINGS = {
     "a clock": text(["timestamp", *HEADER[1:]], 1_700_000_000_000 + 1000 * TIME, QPOS, QVEL),
     "PlotJuggler": text(["__time", *(f"/js/{name}/{what}" for what in ("position", "velocity") for name in JOINTS)],
                         1.7e9 + TIME, QPOS, QVEL),
-    "a robot's own log": text(["timestamp", *(f"{what}_{i}" for what in ("target_q", "actual_q", "actual_qd") for i in (0, 1))],
-                              TIME, QPOS + 0.01, QPOS, QVEL, separator=" "),
+    "a robot's own log": text(["timestamp", "target_q_0", "target_q_1", "actual_q_0", "actual_q_1", "actual_qd_0",
+                               "actual_qd_1"], TIME, QPOS + 0.01, QPOS, QVEL, separator=" "),
     "words and dates": "stamp,frame_id,shoulder,elbow,qdot_shoulder,qdot_elbow\n" + "".join(
         f"2024-05-01T12:00:0{row[0]:.6f}Z,base,{','.join(f'{value:.6f}' for value in row[1:])}\n"
         for row in np.column_stack([TIME, QPOS, QVEL])

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mimic.motions.mocap.arms import find_arms
 from mimic.motions.mocap.conventions import UNITS, UPS, z_up
@@ -72,7 +73,8 @@ def test_up_is_found_from_the_body(tmp_path, expected, up):
     rotated = expected.positions @ z_up(np.eye(3), up).T  # undoes z_up
     np.savez(tmp_path / "p.npz", names=np.array(expected.names), positions=rotated, rate=RATE)
     motion = read_motion(tmp_path / "p.npz")
-    assert f"up: {up}, from the feet to the head" in motion.notes
+    guess = "" if up in ("y", "z", "-y") else ": a guess, capture.up= sets it"
+    assert f"up: {up}, from the feet to the head{guess}" in motion.notes
     np.testing.assert_allclose(motion.positions, expected.positions, atol=1e-9)
 
 
@@ -295,6 +297,29 @@ def test_a_person_who_lies_or_stands_on_the_hands_is_not_turned(tmp_path):
         lines[start:] = [" ".join([*root[:3], *turn.split(), *line.split()[6:]]) for line in lines[start:]]
         motion = read_motion(_bvh(tmp_path, "\n".join(lines), f"{name}.bvh"))
         assert motion.notes[0].startswith("up: y, as usual for such files, though the body is along"), (name, seen)
+
+
+def test_a_person_who_leans_far_is_a_guess(tmp_path, expected):
+    leaning = (
+        Rotation.from_euler("x", 50, degrees=True)
+        .apply(expected.positions.reshape(-1, 3))
+        .reshape(expected.positions.shape)
+    )
+    np.savez(tmp_path / "p.npz", names=np.array(expected.names), positions=leaning, rate=RATE)
+    (note,) = (note for note in read_motion(tmp_path / "p.npz").notes if note.startswith("up: "))
+    assert note.endswith("a guess, capture.up= sets it")
+
+
+def test_exchanged_markers_are_left_out(tmp_path, expected):
+    elbow, wrist = expected.names.index("LeftForeArm"), expected.names.index("LeftHand")
+    positions = expected.positions.copy()
+    positions[20:30, [elbow, wrist]] = positions[20:30, [wrist, elbow]]
+    np.savez(tmp_path / "p.npz", names=np.array(expected.names), positions=positions, rate=RATE)
+    motion = read_motion(tmp_path / "p.npz")
+    assert any(note.startswith("left out: 10 samples at which an arm's length") for note in motion.notes)
+    assert np.isnan(motion.positions[20:30, elbow]).all()
+    np.testing.assert_allclose(np.delete(motion.point("LeftHand"), range(20, 30), axis=0),
+                               np.delete(expected.point("LeftHand"), range(20, 30), axis=0), atol=1e-9)  # fmt: skip
 
 
 def test_up_of_markers_that_were_seen(tmp_path, expected):
