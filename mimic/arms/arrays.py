@@ -20,7 +20,7 @@ from flax import struct
 from jaxtyping import Float, Int
 
 from mimic.arms.arm import Arm, ArmConfig, build_arm, finite_velocity_limit
-from mimic.arms.embodiment import snap_to_units
+from mimic.arms.embodiment import Embodiment, snap_to_units
 from mimic.arms.simulation_model import pseudo_inertia
 from mimic.base.spatial import array_library
 
@@ -55,6 +55,9 @@ class ArmArrays:
       link_position: [links, 3] origin of the link in the frame of that joint, or in the base frame [m].
       link_direction: [links, 3] direction of the link in that frame.
       link_length: [links] length [m].
+      hand_joint: index of the last joint that moves the hand, -1 for none.
+      hand_position: [3] origin of the hand frame in the frame of that joint [m].
+      hand_rotation: [3, 3] hand frame in the frame of that joint.
     """
 
     base_rotation: Float[Any, "3 3"]
@@ -75,6 +78,20 @@ class ArmArrays:
     link_position: Float[Any, "links 3"]
     link_direction: Float[Any, "links 3"]
     link_length: Float[Any, " links"]
+    hand_joint: Int[Any, ""]
+    hand_position: Float[Any, "3"]
+    hand_rotation: Float[Any, "3 3"]
+
+    @property
+    def rows(self) -> tuple[Any, Any, Any]:
+        """Joint, position and direction of each link, and of the x-, y- and z-axis of the hand after them."""
+        numpy = array_library(self.link_position)
+        joint, position = (numpy.stack(3 * [x]) for x in (self.hand_joint, self.hand_position))
+        return (
+            numpy.concatenate([self.link_joint, joint]),
+            numpy.concatenate([self.link_position, position]),
+            numpy.concatenate([self.link_direction, self.hand_rotation.T]),
+        )
 
     @property
     def name(self) -> str:
@@ -102,8 +119,9 @@ class ArmArrays:
 
     def in_chain_lengths(self) -> "ArmArrays":
         """The arm with the lengths of its kinematics in units of its chain length."""
-        unit, names = 1 / self.chain_length, ("base_position", "offset", "link_position", "link_length")
-        return dataclasses.replace(self, **{name: unit * getattr(self, name) for name in names})
+        lengths = "base_position", "offset", "link_position", "link_length", "hand_position"
+        unit = 1 / self.chain_length
+        return dataclasses.replace(self, **{name: unit * getattr(self, name) for name in lengths})
 
     def astype(self, dtype: Any) -> "ArmArrays":
         """The arm with floating numbers of another type."""
@@ -164,8 +182,22 @@ def arm_arrays(
         link_position=_padded(snap_to_units(positions), max_links),
         link_direction=_padded(snap_to_units(directions), max_links),
         link_length=_padded(embodiment.link_lengths, max_links),
+        **_hand_arrays(embodiment, rotations, origins),
     )
     return _with_empty_slots(arrays, joints, links)
+
+
+def _hand_arrays(arm: Embodiment, rotations: np.ndarray, origins: np.ndarray) -> dict[str, Any]:
+    """The fields of the hand of `ArmArrays`, from the frames of the joints."""
+    if not arm.hand_joint:
+        raise ValueError(f"{arm.name}: expected an arm with a hand, as all arms of files have")
+    joint = arm.hand_joint[0]
+    rotation, origin = (rotations[joint], origins[joint]) if joint >= 0 else (np.eye(3), np.zeros(3))
+    return {
+        "hand_joint": np.asarray(joint, np.int32),
+        "hand_position": snap_to_units((arm.hand_position[0] - origin) @ rotation),
+        "hand_rotation": snap_to_units(rotation.T @ arm.hand_rotation[0]),
+    }
 
 
 def body_moments(

@@ -26,6 +26,9 @@ _KINEMATICS: dict[str, tuple[int, ...]] = {
     "link_position": (MAX_LINKS, 3),
     "link_direction": (MAX_LINKS, 3),
     "link_length": (MAX_LINKS,),
+    "hand_joint": (),
+    "hand_position": (3,),
+    "hand_rotation": (3, 3),
 }
 _DYNAMICS: dict[str, tuple[int, ...]] = {
     "first_moment": (MAX_JOINTS, 2),
@@ -72,7 +75,7 @@ def described_arm(vector: Float[Array, " numbers"]) -> ArmArrays:
     }
     for part in description_layout(has_dynamics=has_dynamics):
         parts[part["name"]] = vector[part["start"] : part["stop"]].reshape(part["shape"])
-    parts["link_joint"] = jnp.round(parts["link_joint"]).astype(jnp.int32)
+    parts |= {name: jnp.round(parts[name]).astype(jnp.int32) for name in ("link_joint", "hand_joint")}
     return ArmArrays(**parts)
 
 

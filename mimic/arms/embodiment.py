@@ -296,6 +296,11 @@ def segment_arm(arm: Embodiment) -> Embodiment:
     )
 
 
+def without_hands(arm: Embodiment) -> Embodiment:
+    """The arm with no known hand, as the paper's metric sees it."""
+    return dataclasses.replace(arm, hand_position=np.zeros((0, 3)), hand_rotation=np.zeros((0, 3, 3)), hand_joint=())
+
+
 def in_chain_lengths(arm: Embodiment) -> Embodiment:
     """The arm with all lengths in units of its chain length."""
     length = arm.chain_length

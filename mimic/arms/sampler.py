@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Collection, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -91,7 +92,7 @@ def perturbed_sampler(arms: Sequence[ArmArrays]) -> Sampler:
     damping and velocity limit of each joint have factors of their own. The base is rotated about the vertical.
     """
     table = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(each, jnp.float32) for each in x]), *arms)
-    table = table.replace(link_joint=table.link_joint.astype(jnp.int32))
+    table = table.replace(**{name: getattr(table, name).astype(jnp.int32) for name in ("link_joint", "hand_joint")})
 
     def draw(key: Array) -> ArmArrays:
         key_arm, key_size, key_drives, key_lock = jax.random.split(key, 4)
@@ -120,6 +121,7 @@ def perturbed_sampler(arms: Sequence[ArmArrays]) -> Sampler:
             link_position=length * rotated(arm.link_position),
             link_direction=rotated(arm.link_direction),
             link_length=length * arm.link_length,
+            hand_position=length * arm.hand_position,
         )
         return lock_joints(perturbed, arm.is_free * locked * (number_lock < _LOCKED))
 
@@ -142,6 +144,7 @@ def random_arm(key: Array) -> ArmArrays:
     environment alone. The home pose is 0, and all joint ranges are [-pi, pi].
     """
     key_numbers, key_lengths, key_shape = jax.random.split(key, 3)
+    key_hand = jax.random.fold_in(key, 3)
     numbers = jax.random.uniform(key_numbers, (5, MAX_JOINTS))  # one call compiles faster than many
 
     def uniform(bounds: tuple[float, float], number: Array) -> Array:
@@ -199,7 +202,25 @@ def random_arm(key: Array) -> ArmArrays:
         link_position=_links(present[:, None] * _into(axes_of_link, middles - origin_of_link), links),
         link_direction=_links(_into(axes_of_link, directions), links).at[:, 0].add(1 - _links(present, links)),
         link_length=_links(lengths, links),
+        **_random_hand(anchors + steps, directions[1:], rotations, origins, count, key_hand),
     )
+
+
+def _random_hand(
+    ends: Array, directions: Array, rotations: Array, origins: Array, count: Array, key: Array
+) -> dict[str, Any]:
+    """The fields of the hand of `ArmArrays`: at the end of the last link, along it, rotated about it by any angle."""
+    last = count.astype(jnp.int32) - 1
+    approach, angle = directions[last], jax.random.uniform(key, (), minval=-jnp.pi, maxval=jnp.pi)
+    across = _unit(_without(jnp.eye(3)[jnp.argmin(jnp.abs(approach))], approach))
+    x = jnp.cos(angle) * across + jnp.sin(angle) * jnp.cross(approach, across)
+    frame = jnp.stack([x, jnp.cross(approach, x), approach], axis=1)
+    to_joint = rotations[last].T
+    return {
+        "hand_joint": last,
+        "hand_position": to_joint @ (ends[last] - origins[last]),
+        "hand_rotation": to_joint @ frame,
+    }
 
 
 def _links(values: Array, empty: int) -> Array:

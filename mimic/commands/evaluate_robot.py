@@ -181,7 +181,8 @@ def _torque_model(evaluator: Evaluator, run_dir: Path, steps: int) -> bytes:
         states = [leaf.ravel() for leaf in jax.tree.leaves(link_states(env.learner, qpos, qvel))]
         return {"torque": policy.function(jnp.concatenate([*states, expert]))["torque"]}
 
-    joints, experts = env.learner.num_joints, (env.config.preview + 1) * env.expert.num_links * 12
+    joints, ticks = env.learner.num_joints, env.config.preview + 1
+    experts = ticks * sum(leaf[0, 0].size for leaf in jax.tree.leaves(env.expert_states))
     return to_onnx(function, name="policy", inputs={"qpos": joints, "qvel": joints, "expert": experts})
 
 

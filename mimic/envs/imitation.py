@@ -61,7 +61,8 @@ class ImitationEnv(Env):
     Attributes:
       config: the config; its `physics` is resolved, "mjx" or "fused".
       physics: the physics and the reason for it.
-      expert, learner: the embodiments.
+      embodiments: those of the expert and the learner.
+      expert, learner: the same, without hands where the metric gives these no weight.
       arm: the learner with its simulation model.
       metric: metric of the reward.
       demonstrations: motions to imitate.
@@ -78,7 +79,8 @@ class ImitationEnv(Env):
     def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None):
         compat.mend_brax()  # here: brax's trainers take any environment, wrapped by any function
         arms = config.build_arms()
-        self.expert, self.learner = arms.embodiments
+        self.embodiments = arms.embodiments
+        self.expert, self.learner = map(config.metric.compared, arms.embodiments)
         self.metric = config.metric.build(self.expert, self.learner)
         self.reward_terms = reward_terms(config.reward.terms)
         self.observation_terms = observation_terms(config.observation.terms)
@@ -292,7 +294,9 @@ class ImitationEnv(Env):
                 per_pair = float(self.metric.weights.function(*_opposite_links()))
         # The Frobenius norm is at most the sum of the entries; those of hard and soft W sum to n + n_hat.
         total = n + n_hat if callable(self.metric.correspondence) else np.asarray(self.metric.correspondence).sum()
-        return float(per_pair * total / (n * n_hat if metric.reduction == "mean" else 1))
+        of_links = per_pair * total / (n * n_hat if metric.reduction == "mean" else 1)
+        hand = self.metric.hand_weights
+        return float(of_links + np.pi * hand.rotation + 2 * hand.position)
 
     def expert_at(self, demonstration: Array, step: Array) -> LinkStates:
         """The expert's link states at a step of a demonstration."""
@@ -331,10 +335,10 @@ class ImitationEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        """Length of an observation: twelve numbers for each observed link, and what terms or a subclass change."""
+        """Length of an observation: numbers of each observed link and hand, and what terms or a subclass change."""
         if self._has_own_observation or self.observation_terms:
             return jax.eval_shape(lambda: self.observe(self.start(jax.random.PRNGKey(0)))).size
-        return 12 * (self.learner.num_links + (self.config.preview + 1) * self.expert.num_links)
+        return observation_layout(self.expert, self.learner, self.config.preview)[-1]["stop"]
 
     @property
     def action_size(self) -> int:
@@ -372,19 +376,23 @@ def env_class(config: EnvConfig) -> type[ImitationEnv]:
 
 def observation_layout(expert: Embodiment, learner: Embodiment, preview: int) -> list[dict[str, Any]]:
     """The parts of an observation, in order: name, shape, unit, and the indices where they start and stop."""
-    units = {
-        "position": "chain lengths",
-        "direction": "1",
-        "linear_velocity": "chain lengths/s",
-        "angular_velocity": "rad/s",
-    }
     observed = [("learner", learner), ("expert", expert)]
     observed += [(f"expert {ahead} steps ahead", expert) for ahead in range(1, preview + 1)]
     layout, start = [], 0
     for arm_name, arm in observed:
-        for name, unit in units.items():
-            stop = start + 3 * arm.num_links
-            shape = [arm.num_links, 3]
+        links, hands = arm.num_links, len(arm.hand_joint)
+        parts = [
+            ("position", links, "chain lengths"),
+            ("direction", links, "1"),
+            ("linear_velocity", links, "chain lengths/s"),
+            ("angular_velocity", links, "rad/s"),
+            ("hand position", hands, "chain lengths"),
+            ("hand axes", 3 * hands, "1"),
+            ("hand angular_velocity", hands, "rad/s"),
+        ]
+        for name, rows, unit in parts[: 7 if hands else 4]:
+            stop = start + 3 * rows
+            shape = [rows, 3]
             layout.append({"name": f"{arm_name}: {name}", "shape": shape, "unit": unit, "start": start, "stop": stop})
             start = stop
     return layout

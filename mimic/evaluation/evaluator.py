@@ -154,12 +154,12 @@ class Evaluator:
     @functools.cached_property
     def _expert_line(self) -> CentreLine:
         """Centre lines of the demonstrations after each step."""
-        steps = self.env.config.horizon
-        return centre_line_table(self.env.expert, self.env.demonstrations.qpos[:, 1 : steps + 1].astype(np.float32))
+        steps, expert = self.env.config.horizon, self.env.embodiments[0]
+        return centre_line_table(expert, self.env.demonstrations.qpos[:, 1 : steps + 1].astype(np.float32))
 
     def similarity(self, qpos: Motions) -> Table:
         """Similarity of a learner's motions, one row for each demonstration, see `measure_similarity`."""
-        return measure_similarity(self._expert_line, self.env.learner, np.asarray(qpos, np.float32))
+        return measure_similarity(self._expert_line, self.env.embodiments[1], np.asarray(qpos, np.float32))
 
     @functools.cached_property
     def _baseline_similarity(self) -> dict[str, Table]:

@@ -10,6 +10,7 @@ SIMILARITY_HEADERS = {  # positions in chain lengths
     "frechet_distance": "Frechet\ndistance",
     "hand_position_error": "hand\nposition",
     "hand_angle_deg": "hand\nangle",
+    "hand_rotation_deg": "hand\nrotation",
 }
 SPLIT_NAMES = {"train": "training", "held_out": "held out"}
 SIMILARITY_NAMES = {  # display names that differ from their keys

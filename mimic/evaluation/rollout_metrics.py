@@ -49,11 +49,14 @@ def measure(
     """
     arm = env.learner
     fractions = env.config.metric.link_fractions(env.expert, arm)
-    expert = {key: np.asarray(value)[:, 1 : qpos.shape[1] + 1] for key, value in vars(env.expert_states).items()}
-    cosine = np.einsum("dtix,dtjx->dtij", expert["direction"], np.asarray(learner.direction))
+    states = env.expert_states
+    direction, angular_velocity = (
+        np.asarray(x)[:, 1 : qpos.shape[1] + 1] for x in (states.direction, states.angular_velocity)
+    )
+    cosine = np.einsum("dtix,dtjx->dtij", direction, np.asarray(learner.direction))
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean(axis=1)
     by_link = (angle * fractions).sum(axis=1)
-    difference = expert["angular_velocity"][:, :, :, None] - np.asarray(learner.angular_velocity)[:, :, None]
+    difference = angular_velocity[:, :, :, None] - np.asarray(learner.angular_velocity)[:, :, None]
     velocity_error = (np.linalg.norm(difference, axis=-1).mean(axis=1) * fractions).sum(axis=1)
     relative = torque / np.asarray(env.torque_scale)
     change = np.diff(relative, axis=1)

@@ -19,7 +19,14 @@ from mimic.arms.embodiment import Embodiment
 from mimic.base import spatial
 from mimic.base.spatial import ZERO, Scalar, Vector, add, cross, dot, plus, scale, subtract, times
 from mimic.metric.distance import PARTS
-from mimic.metric.kinematics import JointFrame, LinkVectors, joint_frames, link_vectors
+from mimic.metric.kinematics import (
+    JointFrame,
+    LinkVectors,
+    hand_vectors,
+    joint_frames,
+    link_vectors,
+    row_joints,
+)
 
 _ROTATION = PARTS.index("rotation")
 _REST = LinkVectors(ZERO, ZERO, ZERO, ZERO)
@@ -41,7 +48,7 @@ NO_ADJOINTS = Adjoints(ZERO, ZERO, ZERO, ZERO, ZERO)
 def distance_and_gradient(
     expert: Embodiment,
     learner: Embodiment,
-    factors: Float[np.ndarray, "parts expert learner"],
+    factors: Float[np.ndarray, "parts rows learner_rows"],
     arguments: Sequence[int],
     *motion: Sequence[Scalar],
 ) -> list[list[Scalar]]:
@@ -50,7 +57,7 @@ def distance_and_gradient(
     Args:
       expert: in units of its chain length.
       learner: likewise.
-      factors: factor of each part of each pair's distance; a factor 0 costs nothing.
+      factors: see `mimic.metric.distance.Metric.factors`; a factor 0 costs nothing.
       arguments: indices into `motion`.
       *motion: qpos [rad] and qvel [rad/s] of the expert, then of the learner.
 
@@ -60,6 +67,8 @@ def distance_and_gradient(
     arms = expert, learner
     frames = [joint_frames(arm, *motion[2 * side : 2 * side + 2]) for side, arm in enumerate(arms)]
     links = [link_vectors(arm, arm_frames) for arm, arm_frames in zip(arms, frames, strict=True)]
+    if factors.shape[1] > expert.num_links:  # a row for each axis of a hand too
+        links = [of_arm + hand_vectors(*arm) for of_arm, *arm in zip(links, arms, frames, strict=True)]  # type: ignore[arg-type]
     value, state_gradients = _compare(factors, *links)
     gradients: list[list[Scalar]] = []
     for side, arm in enumerate(arms):
@@ -69,7 +78,7 @@ def distance_and_gradient(
 
 
 def _compare(
-    factors: Float[np.ndarray, "parts expert learner"], expert: list[LinkVectors], learner: list[LinkVectors]
+    factors: Float[np.ndarray, "parts rows learner_rows"], expert: list[LinkVectors], learner: list[LinkVectors]
 ) -> tuple[Scalar, list[list[LinkVectors]]]:
     """Distance of the links, and its gradients with respect to the states of the expert's and the learner's links."""
     value: Scalar = 0.0
@@ -120,7 +129,7 @@ def _by_joints(
     of_children: dict[int, Adjoints] = {}
     for joint in reversed(range(arm.num_joints)):
         distal = of_children.get(joint, NO_ADJOINTS)
-        for link in (link for link, mover in enumerate(arm.link_joint) if mover == joint):
+        for link in (link for link, mover in enumerate(row_joints(arm)[: len(links)]) if mover == joint):
             distal = with_link(distal, links[link], gradients[link])
         frame = frames[joint + 1]
         axis = spatial.rotate(frame.rotation, spatial.vector(arm.joint_axis[joint]))

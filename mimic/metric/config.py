@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.chain import LINKS
-from mimic.arms.chain_match import CHAIN_MATCHES, ChainMatch
-from mimic.arms.embodiment import Embodiment
+from mimic.arms.chain_match import CHAIN_MATCHES, ChainMatch, matched_chains
+from mimic.arms.embodiment import Embodiment, without_hands
 from mimic.arms.link_match import LinkMatch
 from mimic.base import registry
 from mimic.base.config import check_choice
@@ -35,6 +35,7 @@ from mimic.metric.distance import (
     Weights,
     adaptive_weights,
 )
+from mimic.metric.hand import NO_HAND, HandWeights
 
 CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft")
 SOFT_SHARPNESS = -10.0  # xi of the correspondence "soft"
@@ -53,6 +54,8 @@ class MetricConfig:
 
     Attributes:
       translation, rotation, linear_velocity, angular_velocity: weights; per chain length, rad, and their rates.
+      hand_rotation, hand_position, hand_angular_velocity: weights of the hands, see `HandWeights`; without effect where
+        the hand of an arm is not known.
       adaptive: replace the weights of translation and rotation by the paper's distance-dependent ones.
       rotation_measure: "cosine" or "angle".
       links: "kept" (a locked joint removes no link) or "merged" (its two links become one chord; paper).
@@ -68,6 +71,9 @@ class MetricConfig:
     rotation: float = number(1.0, at_least=0.0, at_most=1e6)
     linear_velocity: float = number(0.001, at_least=0.0, at_most=1e6)
     angular_velocity: float = number(0.01, at_least=0.0, at_most=1e6)
+    hand_rotation: float = number(0.0, at_least=0.0, at_most=1e6)
+    hand_position: float = number(0.0, at_least=0.0, at_most=1e6)
+    hand_angular_velocity: float = number(0.0, at_least=0.0, at_most=1e6)
     adaptive: bool = False
     rotation_measure: str = "cosine"
     correspondence: str = "arc_length"
@@ -121,7 +127,19 @@ class MetricConfig:
         """The metric between two arms."""
         correspondence = self.make_correspondence(expert, learner)
         rotation, reduction = cast(RotationMeasure, self.rotation_measure), cast(Reduction, self.reduction)
-        return Metric(correspondence, self.make_weights(), rotation, reduction)
+        return Metric(correspondence, self.make_weights(), rotation, reduction, self._hand_weights(expert, learner))
+
+    def compared(self, arm: Embodiment) -> Embodiment:
+        """The arm with what this metric compares: without hands where they have no weight."""
+        weights = self.hand_rotation, self.hand_position, self.hand_angular_velocity
+        return arm if any(weights) else without_hands(arm)
+
+    def _hand_weights(self, expert: Embodiment, learner: Embodiment) -> HandWeights:
+        weights = HandWeights(self.hand_rotation, self.hand_position, self.hand_angular_velocity)
+        if weights.are_zero or not expert.hand_joint or not learner.hand_joint:
+            return NO_HAND
+        pairs = matched_chains(expert.chain_names, learner.chain_names, cast(ChainMatch, self.chains))
+        return dataclasses.replace(weights, pairs=pairs)
 
     def link_fractions(self, expert: Embodiment, learner: Embodiment) -> Float[np.ndarray, "expert learner"]:
         """Fraction of each expert link in the target of a learner link; columns sum to 1.
@@ -148,7 +166,8 @@ def check_metric(config: MetricConfig) -> DistanceWeights:
       ValueError: a metric other than constant weights with the correspondence by arc length.
     """
     weights = config.make_weights()
-    expected = {"correspondence": "arc_length", "reduction": "mean", "rotation_measure": "cosine", "links": "kept"}
+    expected: dict[str, Any] = {"correspondence": "arc_length", "reduction": "mean", "rotation_measure": "cosine"}
+    expected |= {"links": "kept", "hand_rotation": 0.0, "hand_position": 0.0, "hand_angular_velocity": 0.0}
     different = [f"{key}={getattr(config, key)}" for key, value in expected.items() if getattr(config, key) != value]
     if different or not isinstance(weights, DistanceWeights):
         raise ValueError(

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Real
 from mimic.base import spatial
 from mimic.base.batches import over_batch
 from mimic.base.config import check_choice
+from mimic.metric.hand import NO_HAND, HandWeights, hand_distance, hand_factors
 from mimic.metric.kinematics import LinkStates
 
 RotationMeasure = Literal["cosine", "angle"]
@@ -120,6 +121,9 @@ def link_distances(
 def _link_distances(
     weights: Weights, rotation: RotationMeasure, expert_states: LinkStates, learner_states: LinkStates
 ) -> Float[Array, "expert learner"]:
+    expert_states, learner_states = (
+        dataclasses.replace(states, hand=None) for states in (expert_states, learner_states)
+    )
     if isinstance(weights, LinkDistance):
         own = jax.vmap(jax.vmap(weights.function, in_axes=(None, 0)), in_axes=(0, None))
         return own(expert_states, learner_states)
@@ -145,6 +149,7 @@ class Metric:
       weights: see `link_distances`.
       rotation: see `link_distances`.
       reduction: "mean" of all n n_hat entries of W o D' (paper), or their "frobenius" norm.
+      hand_weights: of the distance of the hands, which is added, see `hand_distance`.
 
     Raises:
       ValueError: an unknown rotation measure or reduction.
@@ -154,6 +159,7 @@ class Metric:
     weights: Weights
     rotation: RotationMeasure = "cosine"
     reduction: Reduction = "mean"
+    hand_weights: HandWeights = NO_HAND
 
     def __post_init__(self) -> None:
         check_choice("rotation", self.rotation, ROTATION_MEASURES)
@@ -171,13 +177,39 @@ class Metric:
 
     @property
     def is_weighted_sum(self) -> bool:
-        """Whether W and weights are constant, and the reduction "mean"."""
+        """Whether W and weights are constant, the reduction "mean", and "cosine" the measure where hands count."""
         constant = not callable(self.correspondence) and isinstance(self.weights, DistanceWeights)
-        return constant and self.reduction == "mean"
+        return constant and self.reduction == "mean" and (self.rotation == "cosine" or self.hand_weights.are_zero)
 
     def __call__(self, expert_states: LinkStates, learner_states: LinkStates) -> Float[Array, "*batch"]:
         """See `embodiment_distance`."""
-        return over_batch(self.reduced, self.link_distances(expert_states, learner_states), axes=2)
+        of_links = over_batch(self.reduced, self.link_distances(expert_states, learner_states), axes=2)
+        if self.hand_weights.are_zero:
+            return of_links
+        distance = functools.partial(hand_distance, weights=self.hand_weights)
+        return of_links + over_batch(distance, expert_states.hand, learner_states.hand, axes=2)
+
+    def factors(self, expert_hands: int = 0, learner_hands: int = 0) -> Float[Any, "4 rows learner_rows"]:
+        """Factor of each of `PARTS` of each pair's distance, of a weighted sum; NumPy where all is constant.
+
+        Args:
+          expert_hands: hands of the expert, whose axes are rows after those of its links, see `hand_factors`.
+          learner_hands: likewise.
+        """
+        assert isinstance(self.weights, DistanceWeights) and not callable(self.correspondence)
+        is_constant = not any(isinstance(x, Tracer) for x in jax.tree.leaves((self.correspondence, self.weights)))
+        numpy = np if is_constant else jnp
+        matrix = numpy.asarray(self.correspondence)
+        weights = [numpy.broadcast_to(numpy.asarray(getattr(self.weights, part)), matrix.shape) for part in PARTS]
+        of_links = numpy.stack(weights) * matrix / matrix.size
+        if self.hand_weights.are_zero:
+            return of_links
+        of_hands = hand_factors(self.hand_weights, expert_hands, learner_hands)
+        numpy = np if isinstance(of_links, np.ndarray) and isinstance(of_hands, np.ndarray) else jnp
+        (n, n_hat), (m, m_hat) = of_links.shape[1:], of_hands.shape[1:]
+        corner, other = numpy.zeros((len(PARTS), n, m_hat)), numpy.zeros((len(PARTS), m, n_hat))
+        above, below = (numpy.concatenate(x, axis=2) for x in ((of_links, corner), (other, of_hands)))
+        return numpy.concatenate([above, below], axis=1)
 
     def link_distances(
         self, expert_states: LinkStates, learner_states: LinkStates
@@ -215,6 +247,7 @@ def embodiment_distance(
     *,
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
+    hand_weights: HandWeights = NO_HAND,
 ) -> Float[Array, "*batch"]:
     """Distance between two embodiments: the reduction of W o D' to one number (paper, Algorithm 1).
 
@@ -225,11 +258,12 @@ def embodiment_distance(
       weights: see `link_distances`.
       rotation: see `link_distances`.
       reduction: see `Metric`.
+      hand_weights: see `Metric`.
 
     Raises:
       ValueError: W has another shape, an unknown measure or reduction, or what `link_distances` rejects.
     """
-    return Metric(correspondence, weights, rotation, reduction)(expert_states, learner_states)
+    return Metric(correspondence, weights, rotation, reduction, hand_weights)(expert_states, learner_states)
 
 
 def pair_distances(a: LinkStates, b: LinkStates, measure: RotationMeasure) -> PairDistances:

@@ -5,7 +5,7 @@ Joint angles and velocities may have batch axes before that of the joints. These
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +20,7 @@ from mimic.arms.embodiment import LONG, Embodiment
 from mimic.base import spatial
 from mimic.base.batches import over_batch
 from mimic.base.spatial import Rotation, Vector
+from mimic.metric.hand import HandStates
 
 
 @struct.dataclass
@@ -44,12 +45,14 @@ class LinkStates:
       direction: unit x-axes of the link frames; None for candidate points.
       linear_velocity: of the origins; in chain lengths per second where normalized, else [m/s].
       angular_velocity: spatial angular velocity [rad/s]; None for candidate points.
+      hand: states of the hands; None for candidate points, and for an arm without a known hand.
     """
 
     position: Float[Array, "links 3"]
     direction: Float[Array, "links 3"] | None
     linear_velocity: Float[Array, "links 3"]
     angular_velocity: Float[Array, "links 3"] | None
+    hand: HandStates | None = None
 
 
 class JointFrame(NamedTuple):
@@ -105,6 +108,31 @@ def _frames(arm: Embodiment, qpos: Float[Array, " joints"]) -> Frames:
     )
 
 
+def hand_frames(arm: Embodiment, qpos: Float[ArrayLike, "*batch joints"]) -> Frames:
+    """Frames of the hands, one for each chain: origins [hands, 3] in metres and rotations [hands, 3, 3].
+
+    The z-axis is the approach, and the gripper opens along the x-axis.
+
+    Args:
+      arm: the embodiment.
+      qpos: joint angles [rad].
+
+    Returns:
+      Frames with the batch axes of `qpos`, if any, before their own; without a hand where none is known.
+
+    Raises:
+      ValueError: `qpos` is not [..., joints].
+    """
+
+    def frames(qpos: Float[Array, " joints"]) -> Frames:
+        vectors = hand_vectors(arm, joint_frames(arm, qpos, None))
+        position = spatial.stack([vector.position for vector in vectors[::3]], qpos.dtype).reshape(-1, 3)
+        axes = spatial.stack([vector.direction for vector in vectors], qpos.dtype).reshape(-1, 3, 3)
+        return Frames(position, jnp.swapaxes(axes, 1, 2))
+
+    return over_batch(frames, joint_values(arm, qpos, "qpos"), axes=1)
+
+
 def link_states(
     arm: Embodiment | ArmArrays,
     qpos: Float[ArrayLike, "*#batch joints"],
@@ -143,8 +171,7 @@ def _link_states(
     if arm.num_joints > LONG:
         arm = jax.tree.map(lambda leaf: jnp.asarray(leaf, qpos.dtype), arm)
         return _states_of_long_arm(arm, qpos, jnp.zeros_like(qpos) if qvel is None else qvel, normalized)
-    columns = _link_state_columns(arm, qpos, qvel, normalized)
-    return LinkStates(*(spatial.stack(column, qpos.dtype) for column in columns))
+    return _stacked(arm, qpos, qvel, lambda vectors: spatial.stack(vectors, qpos.dtype), normalized=normalized)
 
 
 @functools.partial(jax.jit, static_argnames="normalized")
@@ -152,23 +179,36 @@ def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array, normalized: b
     """`link_states` of many joints, whose code does not grow with their number; all numbers have one dtype."""
     frames = (_frames_of_chain if arm.is_serial else _frames_of_tree)(arm, qpos, qvel)
     anchors = jnp.concatenate([jnp.zeros((1, 3), qpos.dtype), arm.joint_anchor])  # the base's first
-    frame_index = np.asarray(arm.link_joint) + 1
-    offsets, directions = arm.link_position - anchors[frame_index], arm.link_rotation[:, :, 0]
-    of_links = jax.tree.map(lambda leaf: leaf[frame_index], frames)
-    return _states_of_links(of_links, offsets, directions, 1 / arm.chain_length if normalized else 1.0)
+    frame_index = np.asarray(row_joints(arm)) + 1
+    positions = jnp.concatenate([arm.link_position, jnp.repeat(arm.hand_position, 3, axis=0)])
+    directions = jnp.concatenate([arm.link_rotation[:, :, 0], jnp.swapaxes(arm.hand_rotation, 1, 2).reshape(-1, 3)])
+    of_rows = jax.tree.map(lambda leaf: leaf[frame_index], frames)
+    unit = 1 / arm.chain_length if normalized else 1.0
+    return _states_of_rows(of_rows, positions - anchors[frame_index], directions, unit, arm.num_links)
 
 
-def _states_of_links(of_links: JointFrame, offsets: Any, directions: Any, unit: Any) -> LinkStates:
-    """States of links by array operations; see `link_state`.
+def _states_of_rows(of_rows: JointFrame, offsets: Any, directions: Any, unit: Any, links: int) -> LinkStates:
+    """States of links and axes of hands by array operations; see `link_state`.
 
     Args:
-      of_links: frame of the body of each link, arrays [links].
-      offsets: [links, 3] of the links' origins, in the frames' axes.
-      directions: [links, 3] in the frames' axes.
+      of_rows: frame of the body of each link, and of the body of each axis of a hand, arrays [rows].
+      offsets: [rows, 3] of the origins, in the frames' axes.
+      directions: [rows, 3] in the frames' axes.
       unit: factor on lengths.
+      links: number of links.
     """
-    links = link_state(of_links, *(spatial.vector(jnp.asarray(x).T) for x in (offsets, directions)))
-    return LinkStates(*(jnp.stack(x, axis=-1) for x in _in_units(unit, links)))
+    vectors = link_state(of_rows, *(spatial.vector(jnp.asarray(x).T) for x in (offsets, directions)))
+    rows = LinkVectors(*(jnp.stack(x, axis=-1) for x in _in_units(unit, vectors)))  # type: ignore[arg-type]
+    hand: Any = LinkVectors(*(x[links:] for x in rows))  # type: ignore[index]
+    return LinkStates(*(x[:links] for x in rows), _hand_states(hand))  # type: ignore[index]
+
+
+def _hand_states(axes: LinkVectors) -> HandStates | None:
+    """The hands, from the states [3 hands, 3] of their axes, as lists or arrays; None where there are none."""
+    if not len(axes.position):
+        return None
+    position, angular_velocity = axes.position[::3], axes.angular_velocity[::3]
+    return HandStates(position, axes.direction, angular_velocity)  # type: ignore[arg-type]
 
 
 FrameTable = Float[Array, "frames 18"]  # rows of frames of the base and of each joint: the numbers of a `JointFrame`
@@ -196,9 +236,10 @@ def axes_and_origins(frames: FrameTable) -> tuple[Float[Array, "joints 3"], Floa
 def states_in_frames(arm: ArmArrays, frames: FrameTable, *, normalized: bool = True) -> LinkStates:
     """Link states of an arm as data, from `frame_table`."""
     arm = arm.astype(frames.dtype)
-    of_links = jax.tree.unflatten(jax.tree.structure(BASE), list(frames[arm.link_joint + 1].T))
+    joint, position, direction = arm.rows
+    of_rows = jax.tree.unflatten(jax.tree.structure(BASE), list(frames[joint + 1].T))
     unit = 1 / arm.chain_length if normalized else 1.0
-    return _states_of_links(of_links, arm.link_position, arm.link_direction, unit)
+    return _states_of_rows(of_rows, position, direction, unit, len(arm.link_length))
 
 
 def _frames_of_chain(arm: Embodiment, qpos: Array, qvel: Array) -> JointFrame:
@@ -248,8 +289,7 @@ def resting_link_states(arm: Embodiment | ArmArrays, qpos: Float[Array, "joints 
     """
     if isinstance(arm, ArmArrays) or arm.num_joints > LONG:
         return jax.vmap(functools.partial(link_states, arm), -1, -1)(qpos)
-    columns = _link_state_columns(arm, [*qpos], None, normalized=True)
-    return LinkStates(*(spatial.stack_batches(column, qpos[0]) for column in columns))
+    return _stacked(arm, [*qpos], None, lambda vectors: spatial.stack_batches(vectors, qpos[0]))
 
 
 def link_state_table(
@@ -272,19 +312,27 @@ def link_state_table(
     shape = np.shape(qpos)[:-1]
     angles, speeds = (np.asarray(x, float).reshape(-1, arm.num_joints).T for x in (qpos, qvel))
 
-    def table(column: list[Vector]) -> np.ndarray:
+    def table(column: Sequence[Vector]) -> Any:
         rows = [np.stack(np.broadcast_arrays(*row, angles[0])[:3], axis=-1) for row in column]
         return np.stack(rows, axis=1).reshape(*shape, len(rows), 3).astype(dtype)
 
     with np.errstate(invalid="ignore", over="ignore"):  # of an unstable rollout
-        return LinkStates(*map(table, _link_state_columns(arm, [*angles], [*speeds], normalized=True)))  # pyright: ignore[reportArgumentType]
+        return _stacked(arm, [*angles], [*speeds], table)
 
 
-def _link_state_columns(arm: Embodiment, qpos: Any, qvel: Any, normalized: bool) -> tuple[list[Vector], ...]:
-    """Position, direction, linear and angular velocity of each link, as scalar components."""
+def _stacked(
+    arm: Embodiment, qpos: Any, qvel: Any, stack: Callable[[Sequence[Vector]], Array], *, normalized: bool = True
+) -> LinkStates:
+    """Link states of scalar components, as arrays that `stack` makes from the vectors of all links."""
     unit = 1 / spatial.scalar(arm.chain_length) if normalized else 1.0
-    links = [_in_units(unit, link) for link in link_vectors(arm, joint_frames(arm, qpos, qvel))]
-    return tuple(list(column) for column in zip(*links, strict=True))
+    frames = joint_frames(arm, qpos, qvel)
+    links, axes = (
+        LinkVectors(*zip(*(_in_units(unit, row) for row in rows), strict=True)) if rows else None
+        for rows in (link_vectors(arm, frames), hand_vectors(arm, frames))
+    )
+    assert links is not None
+    hand = None if axes is None else jax.tree.map(stack, _hand_states(axes), is_leaf=lambda x: isinstance(x, tuple))
+    return LinkStates(*map(stack, links), hand)  # pyright: ignore[reportArgumentType]
 
 
 def _in_units(unit: spatial.Scalar, link: LinkVectors) -> LinkVectors:
@@ -295,7 +343,7 @@ def _in_units(unit: spatial.Scalar, link: LinkVectors) -> LinkVectors:
 
 def candidate_points(states: LinkStates) -> LinkStates:
     """Link states reduced to positions and linear velocities (paper, eq. 11)."""
-    return dataclasses.replace(states, direction=None, angular_velocity=None)
+    return dataclasses.replace(states, direction=None, angular_velocity=None, hand=None)
 
 
 def body_twists(
@@ -434,6 +482,25 @@ def link_vectors(arm: Embodiment, frames: Sequence[JointFrame]) -> list[LinkVect
     ]
 
 
+def hand_vectors(arm: Embodiment, frames: Sequence[JointFrame]) -> list[LinkVectors]:
+    """States of the hands as scalar components: of the x-, y- and z-axis of each, as a link's with its direction.
+
+    Args:
+      arm: the embodiment.
+      frames: from `joint_frames`.
+    """
+    vectors = []
+    for position, rotation, joint in zip(arm.hand_position, arm.hand_rotation, arm.hand_joint, strict=True):
+        offset = spatial.subtract(spatial.vector(position), _anchor(arm, joint))
+        vectors += [link_state(frames[joint + 1], offset, spatial.vector(axis)) for axis in rotation.T]
+    return vectors
+
+
+def row_joints(arm: Embodiment) -> tuple[int, ...]:
+    """Index of the last joint that moves each link, and each axis of a hand after them; -1 for none."""
+    return (*arm.link_joint, *(joint for joint in arm.hand_joint for _ in range(3)))
+
+
 def link_state(frame: JointFrame, offset: Vector, direction: Vector) -> LinkVectors:
     """State of one link.
 
@@ -453,8 +520,12 @@ def link_state(frame: JointFrame, offset: Vector, direction: Vector) -> LinkVect
 
 def _zero_offset(arm: Embodiment, link: int, joint: int) -> Vector:
     """Vector from the anchor of the joint that moves a link to the link's origin, in the zero pose."""
-    anchor = spatial.vector(arm.joint_anchor[joint]) if joint >= 0 else spatial.ZERO
-    return spatial.subtract(spatial.vector(arm.link_position[link]), anchor)
+    return spatial.subtract(spatial.vector(arm.link_position[link]), _anchor(arm, joint))
+
+
+def _anchor(arm: Embodiment, joint: int) -> Vector:
+    """Anchor of a joint in the zero pose; the origin for none."""
+    return spatial.vector(arm.joint_anchor[joint]) if joint >= 0 else spatial.ZERO
 
 
 def joint_values(arm: Embodiment | ArmArrays, values: ArrayLike, name: str) -> Array:

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,14 +18,13 @@ from mimic.base.batches import over_batch
 from mimic.metric import analytic_gradient
 from mimic.metric.distance import (
     PAPER_WEIGHTS,
-    PARTS,
     Correspondence,
-    DistanceWeights,
     Metric,
     Reduction,
     RotationMeasure,
     Weights,
 )
+from mimic.metric.hand import NO_HAND, HandWeights
 from mimic.metric.kinematics import joint_values, link_states
 
 Values = Callable[..., tuple[Array, ...]]  # motions -> distance, gradients
@@ -41,6 +40,7 @@ def motion_distance(
     *,
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
+    hand_weights: HandWeights = NO_HAND,
 ) -> MotionDistance:
     """Returns a function (expert_qpos, expert_qvel, learner_qpos, learner_qvel) -> embodiment distance.
 
@@ -62,6 +62,7 @@ def motion_distance(
       weights: see `embodiment_distance`.
       rotation: see `embodiment_distance`.
       reduction: see `embodiment_distance`.
+      hand_weights: see `embodiment_distance`.
 
     Returns:
       The function. It raises ValueError if an argument is not [..., joints].
@@ -69,7 +70,7 @@ def motion_distance(
     Raises:
       ValueError: what `embodiment_distance` rejects.
     """
-    arms, metric = (expert, learner), Metric(correspondence, weights, rotation, reduction)
+    arms, metric = (expert, learner), Metric(correspondence, weights, rotation, reduction, hand_weights)
 
     def composed(*motion: Array) -> Array:
         states = link_states(expert, *motion[:2]), link_states(learner, *motion[2:])
@@ -78,8 +79,8 @@ def motion_distance(
     # Validates the arguments for all implementations below.
     jax.eval_shape(composed, *(jax.ShapeDtypeStruct((arm.num_joints,), jnp.float32) for arm in arms for _ in range(2)))
     embodiments = [arm for arm in arms if isinstance(arm, Embodiment) and arm.num_joints <= LONG]
-    if len(embodiments) == len(arms) and metric.is_static and _is_constant((arms, correspondence, weights)):
-        factors = _factors(np.asarray(correspondence, float), cast(DistanceWeights, weights))
+    if len(embodiments) == len(arms) and metric.is_static and _is_constant((arms, metric.arguments)):
+        factors = np.asarray(metric.factors(*(len(arm.hand_joint) for arm in embodiments)), float)
         distance = _unrolled([in_chain_lengths(_as_numpy(arm)) for arm in embodiments], factors)
     else:
         distance = composed
@@ -99,12 +100,6 @@ def motion_distance(
 
 def _is_constant(tree: Any) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
-
-
-def _factors(matrix: Float[np.ndarray, "expert learner"], weights: DistanceWeights) -> np.ndarray:
-    """Factor of each part of each pair's distance in the mean, [4, n, n_hat]."""
-    weights_of_parts = [np.broadcast_to(np.asarray(getattr(weights, part), float), matrix.shape) for part in PARTS]
-    return np.stack(weights_of_parts) * matrix / matrix.size
 
 
 def _unrolled(arms: list[Embodiment], factors: np.ndarray) -> Callable[..., Array]:

@@ -23,7 +23,14 @@ from mimic.base.spatial import array_library
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 
 SAMPLES = 64  # of a centre line
-MEASURES = ("centre_line_distance", "tangent_angle_deg", "frechet_distance", "hand_position_error", "hand_angle_deg")
+MEASURES = (
+    "centre_line_distance",
+    "tangent_angle_deg",
+    "frechet_distance",
+    "hand_position_error",
+    "hand_angle_deg",
+    "hand_rotation_deg",
+)
 
 
 @struct.dataclass
@@ -35,6 +42,7 @@ class CentreLine:
       tangents: [*batch, samples, 3] unit directions of the centre line at these points.
       hand_position: [*batch, 3] position of the tip [chain lengths].
       hand_direction: [*batch, 3] unit direction of the last segment.
+      hand_axes: [*batch, 3, 3] unit x-, y- and z-axis of the hand frame; NaN where the hand is not known.
       chains: names of the chains of a tree, which has an axis of its chains behind those of the batch; none for one.
     """
 
@@ -42,6 +50,7 @@ class CentreLine:
     tangents: Float[Any, "*batch samples 3"]
     hand_position: Float[Any, "*batch 3"]
     hand_direction: Float[Any, "*batch 3"]
+    hand_axes: Float[Any, "*batch 3 3"]
     chains: tuple[str, ...] = struct.field(pytree_node=False, default=())
 
 
@@ -64,7 +73,8 @@ def centre_line(
         assert states.direction is not None
         lengths = jnp.asarray(arm.link_length, states.position.dtype)
         start = states.position - 0.5 * lengths[:, None] * states.direction
-        return _sampled_chain(start, states.direction, lengths, lengths.sum(), samples)
+        assert states.hand is not None
+        return _sampled_chain(start, states.direction, lengths, lengths.sum(), samples, states.hand.axes)
     return _sampled(arm, link_states(segment_arm(arm), qpos, normalized=False), samples)
 
 
@@ -84,18 +94,20 @@ def _sampled(arm: Embodiment, segments: LinkStates, samples: int) -> CentreLine:
     start, direction = segments.position, segments.direction
     assert direction is not None
     lengths = np.linalg.norm(np.asarray(arm.segment_end) - np.asarray(arm.segment_start), axis=1)
+    numpy = array_library(start)
+    shape = *start.shape[:-2], len(arm.chains), 3, 3
+    axes = segments.hand.axes.reshape(shape) if segments.hand else numpy.full(shape, np.nan, start.dtype)
     if len(arm.chains) == 1:
-        return _sampled_chain(start, direction, lengths, float(np.cumsum(lengths)[-1]), samples)
+        return _sampled_chain(start, direction, lengths, float(np.cumsum(lengths)[-1]), samples, axes[..., 0, :, :])
     reach = float(segment_arm(arm).chain_length)
     segment_chains = [np.array([s for s, link in enumerate(arm.segment_link) if link in chain]) for chain in arm.chains]
     lines = [
-        _sampled_chain(start[..., own, :], direction[..., own, :], lengths[own], reach, samples)
-        for own in segment_chains
+        _sampled_chain(start[..., own, :], direction[..., own, :], lengths[own], reach, samples, axes[..., i, :, :])
+        for i, own in enumerate(segment_chains)
     ]
-    numpy = array_library(start)
     points, tangents = (numpy.stack([getattr(line, name) for line in lines], -3) for name in ("points", "tangents"))
     hands = (numpy.stack([getattr(line, f"hand_{name}") for line in lines], -2) for name in ("position", "direction"))
-    return CentreLine(points, tangents, *hands, chains=arm.chain_names)
+    return CentreLine(points, tangents, *hands, axes, chains=arm.chain_names)
 
 
 def _check_samples(samples: int) -> None:
@@ -103,7 +115,7 @@ def _check_samples(samples: int) -> None:
         raise ValueError(f"samples: expected at least 1, got {samples}")
 
 
-def _sampled_chain(start: Any, direction: Any, lengths: Any, reach: Any, samples: int) -> CentreLine:
+def _sampled_chain(start: Any, direction: Any, lengths: Any, reach: Any, samples: int, axes: Any) -> CentreLine:
     """The centre line of the segments of one chain.
 
     Args:
@@ -112,6 +124,7 @@ def _sampled_chain(start: Any, direction: Any, lengths: Any, reach: Any, samples
       lengths: [segments] of the segments [m]; 0 for empty slots, none of which has a sample.
       reach: length that is the unit of the result [m].
       samples: number of points.
+      axes: [*batch, 3, 3] of the hand.
     """
     numpy, of_lengths = array_library(start), array_library(lengths)
     ends = of_lengths.cumsum(lengths)
@@ -122,7 +135,7 @@ def _sampled_chain(start: Any, direction: Any, lengths: Any, reach: Any, samples
     points = start[..., index, :] + offset[:, None] * direction[..., index, :]
     tip = start[..., hand, :] + numpy.asarray(lengths[hand], start.dtype) * direction[..., hand, :]
     unit = numpy.asarray(1 / reach, start.dtype)
-    return CentreLine(unit * points, direction[..., index, :], unit * tip, direction[..., hand, :])
+    return CentreLine(unit * points, direction[..., index, :], unit * tip, direction[..., hand, :], axes)
 
 
 def centre_line_distance(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
@@ -214,6 +227,14 @@ def hand_angle(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
     return _angle(expert.hand_direction, learner.hand_direction)
 
 
+def hand_rotation(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
+    """Angle of the rotation between the hand frames [rad], in [0, pi]; NaN where a hand is not known."""
+    numpy, difference = array_library(expert.hand_axes), expert.hand_axes - learner.hand_axes
+    # |R - R_hat| = sqrt(8) sin(theta / 2)
+    square = (difference * difference).sum(axis=(-1, -2)) / 8
+    return 2 * numpy.arcsin(numpy.minimum(numpy.sqrt(square), 1))
+
+
 def similarity(expert: CentreLine, learner: CentreLine) -> dict[str, Float[Any, "*batch"]]:
     """All measures by their names in `MEASURES`, angles in degrees; 0 means equal.
 
@@ -234,6 +255,7 @@ def similarity(expert: CentreLine, learner: CentreLine) -> dict[str, Float[Any, 
         frechet_distance(expert, learner),
         hand_position_error(expert, learner),
         degrees * hand_angle(expert, learner),
+        degrees * hand_rotation(expert, learner),
     )
     if is_tree:
         values = tuple(value.mean(axis=-1) for value in values)
@@ -247,14 +269,15 @@ def _matched(expert: CentreLine, learner: CentreLine) -> tuple[CentreLine, Centr
     matched = []
     for line, index in zip(lines, pairs.T, strict=True):
         points, tangents = line.points[..., index, :, :], line.tangents[..., index, :, :]
-        hands = line.hand_position[..., index, :], line.hand_direction[..., index, :]
+        hands = line.hand_position[..., index, :], line.hand_direction[..., index, :], line.hand_axes[..., index, :, :]
         matched.append(CentreLine(points, tangents, *hands))
     return matched[0], matched[1]
 
 
 def _with_chain(line: CentreLine) -> CentreLine:
     parts = line.points[..., None, :, :], line.tangents[..., None, :, :]
-    return CentreLine(*parts, line.hand_position[..., None, :], line.hand_direction[..., None, :], chains=("arm",))
+    hands = line.hand_position[..., None, :], line.hand_direction[..., None, :], line.hand_axes[..., None, :, :]
+    return CentreLine(*parts, *hands, chains=("arm",))
 
 
 def _norm(vectors: Any) -> Any:

@@ -13,6 +13,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import pose_limits
 from mimic.base.compilation import compiled_once
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
+from mimic.metric.hand import NO_HAND, HandWeights
 from mimic.metric.kinematics import LinkStates, link_states
 from mimic.retargeting.pose import shared_joints
 from mimic.retargeting.quasi_newton import Descent, bfgs
@@ -53,6 +54,7 @@ def kinematic_bound(
     *,
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
+    hand_weights: HandWeights = NO_HAND,
     starts: int = 5,
     iterations: int = 20,
     seed: int = 0,
@@ -71,6 +73,7 @@ def kinematic_bound(
         weights,
         rotation=rotation,
         reduction=reduction,
+        hand_weights=hand_weights,
         starts=starts,
         iterations=iterations,
         seed=seed,
@@ -88,6 +91,7 @@ def closest_motion(
     *,
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
+    hand_weights: HandWeights = NO_HAND,
     starts: int = 5,
     iterations: int = 20,
     seed: int = 0,
@@ -119,6 +123,7 @@ def closest_motion(
       weights: see `embodiment_distance`.
       rotation: see `embodiment_distance`.
       reduction: see `embodiment_distance`.
+      hand_weights: see `embodiment_distance`.
       starts: number of random initial guesses for each step; more, and more random hops, for T below 26, where steps
         have few neighbours.
       iterations: of the first descents; those of each round take half as many.
@@ -135,7 +140,7 @@ def closest_motion(
     if starts < 1 or iterations < 1:
         raise ValueError(f"starts, iterations: expected at least 1, got {starts} and {iterations}")
 
-    metric = Metric(correspondence, weights, rotation, reduction)
+    metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
     return _motion_solver(expert, learner, metric, starts, iterations, seed)(qpos, qvel)
 
 

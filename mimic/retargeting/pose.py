@@ -19,6 +19,7 @@ from mimic.base.compilation import compiled_once
 from mimic.base.config import check_choice
 from mimic.base.spatial import array_library
 from mimic.metric.distance import Correspondence, DistanceWeights, Metric, Reduction, RotationMeasure, Weights
+from mimic.metric.hand import NO_HAND, HandWeights
 from mimic.metric.kinematics import resting_link_states
 from mimic.retargeting.costs import Costs, with_costs
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
@@ -63,6 +64,7 @@ def imitate_pose(
     kept: int | None = 2,
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
+    hand_weights: HandWeights = NO_HAND,
     costs: Costs | None = None,
     capsules: Capsules | None = None,
 ) -> PoseImitation:
@@ -96,6 +98,7 @@ def imitate_pose(
         the computation; on a GPU it halves the compilation.
       rotation: see `embodiment_distance`.
       reduction: see `embodiment_distance`.
+      hand_weights: see `embodiment_distance`.
       costs: see `Costs`; None for the embodiment distance alone. The returned distance is without them.
       capsules: of the learner, from `fit_capsules`, for the costs of collisions.
 
@@ -117,7 +120,7 @@ def imitate_pose(
             "costs: expected velocity and acceleration of 0 for single poses; imitate_trajectory takes them"
         )
     warm = None if warm_start is None else checked_poses(learner, _concrete(warm_start), "warm_start")
-    metric = Metric(correspondence, weights, rotation, reduction)
+    metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
     descents = Descents(method, count, kept)
     dtype = jax.dtypes.canonicalize_dtype(poses.dtype)
     candidates = random_poses(learner, key, max(starts, 1), dtype)
@@ -162,6 +165,7 @@ class _PoseData(NamedTuple):
       expert, learner: the arms.
       matrix: correspondence of the links.
       weights: of the metric.
+      hand_weights: of the metric; None where it has no hand.
       pairs: [pairs, 2] links of both; all whose correspondence is not 0, and some others up to a fixed number.
     """
 
@@ -169,6 +173,7 @@ class _PoseData(NamedTuple):
     learner: ArmArrays
     matrix: Any
     weights: DistanceWeights
+    hand_weights: HandWeights | None
     pairs: Any
 
 
@@ -193,8 +198,9 @@ def _data_of(expert: Any, learner: Any, metric: Metric, costs: Costs, dtype: Any
         pairs, empty = np.argwhere(matrix != 0), np.argwhere(matrix == 0)
         count = sum(shape) if len(pairs) <= sum(shape) else matrix.size  # that of chains by arc length is below the sum
         pairs = np.concatenate([pairs, empty, empty[:1].repeat(sum(shape), axis=0)])[:count]
+    hand_weights = None if metric.hand_weights.are_zero else metric.hand_weights  # None: traced numbers are never zero
     matrix, weights = jax.tree.map(lambda x: _concrete(x).astype(dtype), (metric.correspondence, metric.weights))
-    return _PoseData(expert.astype(dtype), learner.astype(dtype), matrix, weights, pairs)
+    return _PoseData(expert.astype(dtype), learner.astype(dtype), matrix, weights, hand_weights, pairs)
 
 
 @compiled_once
@@ -202,7 +208,11 @@ def _data_solver(descents: Descents, random: bool, rotation: RotationMeasure) ->
     """The function of data, poses, warm starts and random poses that `imitate_pose` compiles for arms as data."""
 
     def solve(data: _PoseData, batch: Array, warm: Array | None, candidates: RandomPoses) -> PoseImitation:
-        objective = pose_objective(data.learner, Metric(data.matrix, data.weights, rotation), data.pairs)
+        objective = pose_objective(
+            data.learner,
+            Metric(data.matrix, data.weights, rotation, hand_weights=data.hand_weights or NO_HAND),
+            data.pairs,
+        )
         return _nearest(data.expert, data.learner, objective, descents, batch, warm, candidates, random)
 
     return solve

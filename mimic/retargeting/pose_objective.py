@@ -14,9 +14,17 @@ from jaxtyping import Array, Bool, Int
 from mimic.arms.arrays import ArmArrays
 from mimic.arms.embodiment import Embodiment, in_chain_lengths
 from mimic.base import spatial
-from mimic.base.spatial import Rotation, Vector
-from mimic.metric.distance import DistanceWeights, Metric, RotationMeasure
-from mimic.metric.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
+from mimic.base.spatial import Rotation, Vector, array_library
+from mimic.metric.distance import PARTS, DistanceWeights, Metric, RotationMeasure
+from mimic.metric.kinematics import (
+    LinkStates,
+    hand_vectors,
+    joint_axes,
+    joint_frames,
+    link_states,
+    link_vectors,
+    row_joints,
+)
 from mimic.retargeting.closed_form import (
     SMOOTHING,
     Body,
@@ -111,6 +119,8 @@ def automatic_derivatives(function: Callable[[Array], Array], qpos: Scalars) -> 
 class StaticTarget(NamedTuple):
     """Target of a weighted sum: pulls on the learner's directions and positions (`mimic.retargeting.closed_form`).
 
+    Rows are links, and the axes of hands after them where the metric has hands, see `Metric.factors`.
+
     Attributes:
       units, strengths: [directions, 3], [directions] of the pulls on directions.
       points, weights: [pairs, 3], [pairs] of the pulls on positions.
@@ -127,37 +137,49 @@ def _static(
 ) -> PoseObjective:
     """Constant W and weights, and the mean: sums of W_ij (pi/2) (1 - e_i . e^_j) or angles, and W_ij |p_i - p^_j|.
 
-    For the cosines the expert reduces to one pull on each link of the learner, t_j = sum_i W_ij e_i.
+    For the cosines the expert reduces to one pull on each row of the learner, t_j = sum_i W_ij e_i.
     """
     correspondence, weights = cast(Any, metric.correspondence), cast(DistanceWeights, metric.weights)
-    directions, positions = (_pair_weights(correspondence, w) for w in (weights.rotation, weights.translation))
+    has_hand, shape = not metric.hand_weights.are_zero, np.shape(correspondence)
+    expert_hands = 1 + max(i for i, _ in metric.hand_weights.pairs)
+    factors = metric.factors(expert_hands, 1 if isinstance(learner, ArmArrays) else len(learner.hand_joint))
+    positions, directions = (factors[PARTS.index(part)] for part in ("translation", "rotation"))
     pairs = _weighted_pairs(correspondence, weights.translation) if chosen is None else chosen
+    if has_hand:
+        hands = [[shape[0] + 3 * i, shape[1] + 3 * j] for i, j in metric.hand_weights.pairs]
+        pairs = array_library(pairs).concatenate([pairs, np.array(hands)])
     angles = None
     if metric.rotation == "angle":
         angles = _weighted_pairs(correspondence, weights.rotation) if chosen is None else chosen
-    directed = (
-        np.arange(np.shape(correspondence)[1]) if angles is None else angles[:, 1]
-    )  # link of each direction's pull
+    directed = np.arange(directions.shape[1]) if angles is None else angles[:, 1]  # row of each direction's pull
+
+    def rows(states: LinkStates) -> tuple[Array, Array]:
+        assert states.direction is not None
+        if not has_hand:
+            return states.position, states.direction
+        assert states.hand is not None
+        position = jnp.concatenate([states.position, jnp.repeat(states.hand.position, 3, axis=0)])
+        return position, jnp.concatenate([states.direction, states.hand.axes])
 
     def pulls_on_directions(direction: Array) -> tuple[Array, Array]:
         if angles is not None:
             return direction[angles[:, 0]], jnp.asarray(directions[angles[:, 0], angles[:, 1]], direction.dtype)
         # Elementwise, so that nothing is rounded to TF32.
-        pull = np.pi / 2 * jnp.sum(directions[:, :, None] * direction[:, None, :], axis=0)
+        pull = np.pi / 2 * jnp.sum(directions[:, :, None] * direction[: len(directions), None, :], axis=0)
         strength = spatial.safe_sqrt(jnp.sum(pull * pull, axis=-1))
         unit = pull / jnp.maximum(strength, jnp.finfo(pull.dtype).tiny)[:, None]
         return unit.astype(direction.dtype), strength.astype(direction.dtype)
 
     def target(states: LinkStates, _: Any = None) -> StaticTarget:
-        assert states.direction is not None
-        units, strengths = pulls_on_directions(states.direction)
-        points = states.position[pairs[:, 0]]
+        position, direction = rows(states)
+        units, strengths = pulls_on_directions(direction)
+        points = position[pairs[:, 0]]
         weights = jnp.asarray(positions[pairs[:, 0], pairs[:, 1]], points.dtype)
         return StaticTarget(units, strengths, points, weights)
 
     def value(target: StaticTarget, states: LinkStates) -> Array:
-        assert states.direction is not None
-        direction = states.direction[directed]
+        position, direction = rows(states)
+        direction = direction[directed]
         if angles is None:
             turned = np.pi / 2 * directions.sum() - jnp.sum(target.strengths[:, None] * target.units * direction)
         else:
@@ -165,50 +187,57 @@ def _static(
             cosine = jnp.sum(direction * target.units, axis=-1)
             angle = smoothed_angle(cosine, jnp.sum(sine * sine, axis=-1), SMOOTHING.angle)
             turned = jnp.sum(target.strengths * angle)
-        difference = states.position[pairs[:, 1]] - target.points
+        difference = position[pairs[:, 1]] - target.points
         square = jnp.sum(difference * difference, axis=-1)
         return jnp.sum(target.weights * smoothed_length(square, SMOOTHING.length)) + turned
 
     make = _of_data if isinstance(learner, ArmArrays) else _of_constant
-    derivatives = make(learner, pairs, directed, metric.rotation)  # type: ignore[arg-type]
+    derivatives = make(learner, pairs, directed, metric.rotation, has_hand)  # type: ignore[arg-type]
     return PoseObjective(metric, target, value, derivatives, is_elementwise=True)
 
 
 def _of_constant(
-    learner: Embodiment, pairs: np.ndarray, directed: np.ndarray, rotation: RotationMeasure
+    learner: Embodiment, pairs: np.ndarray, directed: np.ndarray, rotation: RotationMeasure, has_hand: bool
 ) -> Callable[..., Derivatives]:
-    """The derivatives for an embodiment, with all links and pairs unrolled."""
+    """The derivatives for an embodiment, with all rows and pairs unrolled."""
     arm = in_chain_lengths(learner)
+    joints = row_joints(arm) if has_hand else arm.link_joint
 
     def kinematics(qpos: Scalars) -> tuple[list[Vector], list[Vector], list[tuple[Vector, Vector]]]:
         frames = joint_frames(arm, qpos, None)
-        vectors = [(link.direction, link.position) for link in link_vectors(arm, frames)]
+        rows = link_vectors(arm, frames) + (hand_vectors(arm, frames) if has_hand else [])
+        vectors = [(row.direction, row.position) for row in rows]
         return joint_axes(arm, frames), [frame.anchor for frame in frames[1:]], vectors
 
     def derivatives(
         target: StaticTarget, qpos: Scalars, store: Store = call, smoothing: Smoothing = SMOOTHING
     ) -> Derivatives:
         axes, anchors, vectors = store(kinematics, tuple(qpos))
-        links = [Body(joint, *vector) for joint, vector in zip(arm.link_joint, vectors, strict=True)]
-        pulls = [_pull(target, directed == link, pairs[:, 1] == link) for link in range(learner.num_links)]
-        return static_derivatives(axes, anchors, links, pulls, arm.joint_parent, smoothing, rotation=rotation)
+        rows = [Body(joint, *vector) for joint, vector in zip(joints, vectors, strict=True)]
+        pulls = [_pull(target, directed == row, pairs[:, 1] == row) for row in range(len(rows))]
+        return static_derivatives(axes, anchors, rows, pulls, arm.joint_parent, smoothing, rotation=rotation)
 
     return derivatives
 
 
-def _of_data(learner: ArmArrays, pairs: Any, directed: Any, rotation: RotationMeasure) -> Callable[..., Derivatives]:
+def _of_data(
+    learner: ArmArrays, pairs: Any, directed: Any, rotation: RotationMeasure, has_hand: bool
+) -> Callable[..., Derivatives]:
     """The derivatives for an arm as data: links and pairs are rows of arrays, and the links' joints may be traced.
 
     On two cores a Panda's pose takes twice the time of that of a constant arm, and a batch six times; it compiles as
     long, once for all arms.
     """
     arm, joints = learner.in_chain_lengths(), learner.num_joints
+    row_joint, row_position, row_direction = (
+        arm.rows if has_hand else (arm.link_joint, arm.link_position, arm.link_direction)
+    )
 
     def columns(vectors: Any) -> Vector:
         return vectors[:, 0, None, None], vectors[:, 1, None, None], vectors[:, 2, None, None]
 
     def of_rows(frames: Array, links: Any, vectors: Any) -> tuple[Rotation, Vector, Vector]:
-        x = jnp.moveaxis(frames[jnp.asarray(arm.link_joint)[links] + 1], 1, 0)
+        x = jnp.moveaxis(frames[jnp.asarray(row_joint)[links] + 1], 1, 0)
         return (tuple(x[:3]), tuple(x[3:6]), tuple(x[6:9])), tuple(x[9:12]), columns(jnp.asarray(vectors)[links])  # type: ignore[return-value]
 
     def derivatives(
@@ -232,11 +261,11 @@ def _of_data(learner: ArmArrays, pairs: Any, directed: Any, rotation: RotationMe
         directions = Pull([units], [target.strengths[:, None]], [], [])
 
         def position_of_pairs(table: Array) -> Vector:
-            rotation_of_link, anchor, offset = of_rows(table, pairs[:, 1], arm.link_position)
+            rotation_of_link, anchor, offset = of_rows(table, pairs[:, 1], row_position)
             return spatial.add(anchor, spatial.rotate(rotation_of_link, offset))
 
         def direction_of_links(table: Array) -> Vector:
-            rotation_of_link, _, direction = of_rows(table, directed, arm.link_direction)
+            rotation_of_link, _, direction = of_rows(table, directed, row_direction)
             return spatial.rotate(rotation_of_link, direction)
 
         of_pairs = add_position(Load(), store(position_of_pairs, table), positions, smoothing.length)
@@ -244,8 +273,8 @@ def _of_data(learner: ArmArrays, pairs: Any, directed: Any, rotation: RotationMe
         loads = [
             total(*both)
             for both in zip(
-                distal_loads(of_pairs, jnp.asarray(arm.link_joint)[pairs[:, 1]], joints),
-                distal_loads(of_links, jnp.asarray(arm.link_joint)[directed], joints),
+                distal_loads(of_pairs, jnp.asarray(row_joint)[pairs[:, 1]], joints),
+                distal_loads(of_links, jnp.asarray(row_joint)[directed], joints),
                 strict=True,
             )
         ]
@@ -254,14 +283,6 @@ def _of_data(learner: ArmArrays, pairs: Any, directed: Any, rotation: RotationMe
         return derivatives_of_loads(axes, anchors, loads, range(-1, joints - 1), loads[0].value)  # type: ignore[arg-type]
 
     return derivatives
-
-
-def _pair_weights(correspondence: Any, weight: Any) -> Any:
-    """W o weight, divided by the number of pairs: [expert, learner]; by NumPy where both are constants."""
-    is_constant = not any(isinstance(x, Tracer) for x in (correspondence, weight))
-    numpy = np if is_constant else jnp
-    matrix = numpy.asarray(correspondence)
-    return numpy.broadcast_to(numpy.asarray(weight), matrix.shape) * matrix / matrix.size
 
 
 def _weighted_pairs(correspondence: Any, weight: Any) -> Int[np.ndarray, "pairs 2"]:
@@ -275,7 +296,7 @@ def _weighted_pairs(correspondence: Any, weight: Any) -> Int[np.ndarray, "pairs 
 
 
 def _pull(target: StaticTarget, directions: Bool[np.ndarray, " directions"], pairs: Bool[np.ndarray, " pairs"]) -> Pull:
-    """Pull on one link as scalars, from those of the target's directions and pairs that are on it."""
+    """Pull on one row as scalars, from those of the target's directions and pairs that are on it."""
     directions, pairs = np.flatnonzero(directions), np.flatnonzero(pairs)
     return Pull(
         [spatial.vector(target.units[i]) for i in directions],

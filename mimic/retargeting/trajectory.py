@@ -15,6 +15,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints, pose_limits
 from mimic.base.compilation import compiled_once
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
+from mimic.metric.hand import NO_HAND, HandWeights
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.closed_form import ROUGH_SMOOTHING
 from mimic.retargeting.costs import Costs, smoothness_derivatives, sum_of, with_costs
@@ -40,6 +41,7 @@ def imitate_trajectory(
     key: Array | None = None,
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
+    hand_weights: HandWeights = NO_HAND,
     costs: Costs | None = None,
     capsules: Capsules | None = None,
 ) -> PoseImitation:
@@ -63,6 +65,7 @@ def imitate_trajectory(
       key: see `imitate_pose`.
       rotation: see `embodiment_distance`.
       reduction: see `embodiment_distance`.
+      hand_weights: see `embodiment_distance`.
       costs: see `Costs`; None for the embodiment distance alone. Those of velocity and acceleration are minimised pose
         by pose, each against the two poses before it. The returned distance is without costs.
       capsules: of the learner, from `fit_capsules`, for the costs of collisions.
@@ -80,7 +83,7 @@ def imitate_trajectory(
     costs = Costs() if costs is None else costs
     costs.check_capsules(capsules)
     jump = jnp.broadcast_to(jnp.asarray(largest_jump, poses.dtype), (learner.num_joints,))
-    metric = Metric(correspondence, weights, rotation, reduction)
+    metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
     solve = _trajectory_solver(expert, learner, metric, bool(starts), costs, capsules if costs.of_capsules else None)
     return solve(poses, jump, random_poses(learner, key, max(starts, 1), poses.dtype))
 

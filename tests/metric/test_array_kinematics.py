@@ -1,6 +1,5 @@
 """Link states of any arm against those of its embodiment, and their derivatives."""
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -110,4 +109,4 @@ def test_single_precision_and_locked_arms(x64):
         for name in FIELDS:
             actual = getattr(states, name)[: reduced.embodiment.num_links]
             np.testing.assert_allclose(actual, getattr(expected, name), rtol=0, atol=atol)
-    assert {x.dtype for x in dataclasses.asdict(in_single).values()} == {np.dtype(np.float32)}
+    assert {x.dtype for x in jax.tree.leaves(in_single)} == {np.dtype(np.float32)}

@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +34,8 @@ def distances_of(combinations):
 
 
 def generic_states(dtype):
-    return tuple(jnp.stack(jax.tree.leaves(states(arm, seed, dtype))) for seed, arm in enumerate((EXPERT, LEARNER)))
+    of_arms = (states(arm, seed, dtype) for seed, arm in enumerate((EXPERT, LEARNER)))
+    return tuple(jnp.stack(jax.tree.leaves(dataclasses.replace(x, hand=None))) for x in of_arms)
 
 
 def singular_states(dtype):

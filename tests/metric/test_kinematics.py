@@ -304,7 +304,7 @@ def test_the_table_of_link_states_equals_link_states():
     qpos, qvel = np.random.default_rng(0).normal(size=(2, 3, 4, arm.num_joints))
     table = link_state_table(arm, qpos, qvel)
     one_by_one = jax.jit(lambda *motion: mimic.link_states(arm, *motion))(qpos, qvel)
-    for name, values in vars(one_by_one).items():
-        actual = getattr(table, name)
+    assert jax.tree.structure(table) == jax.tree.structure(one_by_one)
+    for actual, values in zip(*map(jax.tree.leaves, (table, one_by_one)), strict=True):
         assert isinstance(actual, np.ndarray) and actual.dtype == np.float32
         np.testing.assert_allclose(actual, values, atol=1e-5)  # float32 against float64 that is rounded

@@ -77,7 +77,7 @@ def make_function(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFu
 
 def _policy(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFunction:
     arms = trained.env.build_arms()
-    expert, learner = arms.embodiments
+    expert, learner = map(trained.env.metric.compared, arms.embodiments)
     if trained.env.observation.terms or trained.env.environment:
         layout = layout_of(run_environment(trained.env, run_dir)[0])
     else:

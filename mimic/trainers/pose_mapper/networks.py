@@ -38,7 +38,9 @@ class FullyConnected(nn.Module):
 
 def _link_inputs(target: Target) -> Array:
     assert target.states.direction is not None
-    return jnp.concatenate([target.states.position.ravel(), target.states.direction.ravel()])
+    states, has_hand = target.states, not target.pair.metric.hand_weights.are_zero
+    parts = [states.position, states.direction, *([states.hand.axes] if has_hand and states.hand else [])]
+    return jnp.concatenate([part.ravel() for part in parts])
 
 
 def _angle_inputs(target: Target) -> Array:

@@ -158,7 +158,7 @@ def _policy_sizes(config: TrainConfig) -> tuple[int, int]:
     """Size of the observation, and number of the learner's joints."""
     from mimic.envs.imitation import observation_layout
 
-    expert, learner = config.env.build_arms().embodiments
+    expert, learner = map(config.env.metric.compared, config.env.build_arms().embodiments)
     return observation_layout(expert, learner, config.env.preview)[-1]["stop"], learner.num_joints
 
 
