@@ -32,11 +32,15 @@ from .metric.distance import adaptive_weights as adaptive_weights
 from .metric.distance import embodiment_distance as embodiment_distance
 from .metric.distance import link_distances as link_distances
 from .metric.distance import rotation_distance as rotation_distance
+from .metric.hand import HandStates as HandStates
+from .metric.hand import HandWeights as HandWeights
+from .metric.hand import hand_distance as hand_distance
 from .metric.kinematics import Frames as Frames
 from .metric.kinematics import LinkStates as LinkStates
 from .metric.kinematics import body_twists as body_twists
 from .metric.kinematics import candidate_points as candidate_points
 from .metric.kinematics import forward_kinematics as forward_kinematics
+from .metric.kinematics import hand_frames as hand_frames
 from .metric.kinematics import link_states as link_states
 from .metric.landscape import distance_landscape as distance_landscape
 from .metric.landscape import local_minima as local_minima
