@@ -22,9 +22,9 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 
 
 def read_arrays(
-    path: str | os.PathLike[str], names: Collection[str], max_bytes: int = MAX_BYTES
+    path: str | os.PathLike[str], names: Collection[str] | None, max_bytes: int = MAX_BYTES
 ) -> dict[str, np.ndarray]:
-    """The arrays of an npz file with these names, as far as it has them.
+    """The arrays of an npz file with these names, as far as it has them; all for None.
 
     Raises:
       ValueError: no npz file, a damaged one, or arrays of objects, of more than `max_bytes`, or with text that cannot
@@ -38,7 +38,7 @@ def read_arrays(
                 entries = {entry.filename: entry for entry in archive.infolist()}
                 for entry in entries.values():
                     archive.open(entry).close()  # reads its own header, whose name must be that of the directory
-                for name in names:
+                for name in [key.removesuffix(".npy") for key in entries] if names is None else names:
                     if f"{name}.npy" in entries:
                         arrays[name] = _read_array(archive, entries[f"{name}.npy"], max_bytes)
                         max_bytes -= 8 * arrays[name].size

@@ -121,10 +121,8 @@ def read_recording(
       ValueError: a source that is missing or has another format, lacks joints, or whose units are not known; motions
         beyond the range; a package that is not installed.
     """
-    source, names = Path(path), tuple(joints) or arm.joint_names
-    if len(names) != arm.num_joints:
-        raise ValueError(f"joints: expected {arm.num_joints} names, of {', '.join(arm.joint_names)}, got {len(names)}")
-    recording = _read(source, names, topic, rate)
+    source, names = Path(path), source_names(arm, joints)
+    recording = read_source(source, names, topic, rate)
     model_range = np.asarray(arm.joint_range if joint_range is None else joint_range, float)
     unit, line = find_unit(str(source), recording, arm.joint_names, model_range, units)
     recording = in_rad(recording, unit, model_range)
@@ -143,6 +141,17 @@ def read_recording(
     return recording._replace(motions=motions, notes=tuple(lines))
 
 
+def source_names(arm: Embodiment, joints: Sequence[str]) -> tuple[str, ...]:
+    """The names by which an arm's joints are looked for in a source.
+
+    Raises:
+      ValueError: not as many as the arm has joints.
+    """
+    if joints and len(joints) != arm.num_joints:
+        raise ValueError(f"joints: expected {arm.num_joints} names, of {', '.join(arm.joint_names)}, got {len(joints)}")
+    return tuple(joints) or arm.joint_names
+
+
 def _summary(motions: Mapping[str, Motion]) -> str:
     """How many motions of which length and rate there are, and where their velocities are from."""
     seconds = sum(motion.time[-1] - motion.time[0] for motion in motions.values())
@@ -158,8 +167,8 @@ def _count(motions: int) -> str:
     return f"{motions} motion" + "s" * (motions != 1)
 
 
-def _read(source: Path, names: Sequence[str], topic: str, rate: float | None) -> Recording:
-    """The motions of a file or a folder, as it has them."""
+def read_source(source: Path, names: Sequence[str], topic: str, rate: float | None) -> Recording:
+    """The motions of a file or a folder, as it has them; see `read_recording`."""
     if is_lerobot(source):
         return read_lerobot(source, names, topic)
     if is_rosbag2(source):

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from mimic.base.config import check_choice
 from mimic.motions.cleaning import FULL_TURN
-from mimic.motions.formats.episodes import Recording
+from mimic.motions.formats.episodes import Motion, Recording
 
 UNITS = ("rad", "deg", "percent")
 _SCALE = {"rad": 1.0, "deg": np.pi / 180}  # rad
@@ -92,12 +92,7 @@ def in_rad(recording: Recording, unit: str, joint_range: Float[np.ndarray, "join
     Raises:
       ValueError: percent of a joint without a range.
     """
-    if unit == "percent":
-        if np.any(np.ptp(joint_range, axis=1) >= FULL_TURN):
-            raise ValueError("units=percent: expected an arm whose joints all have limits, as with limits=hardware")
-        scale, offset = np.ptp(joint_range, axis=1) / 200, joint_range.mean(axis=1)
-    else:
-        scale, offset = np.full(len(joint_range), _SCALE[unit]), np.zeros(len(joint_range))
+    scale, offset = _scale_and_offset(unit, joint_range)
     motions = {
         name: motion._replace(
             qpos=offset + scale * motion.qpos, qvel=None if motion.qvel is None else scale * motion.qvel
@@ -105,3 +100,20 @@ def in_rad(recording: Recording, unit: str, joint_range: Float[np.ndarray, "join
         for name, motion in recording.motions.items()
     }
     return recording._replace(motions=motions, unit="rad")
+
+
+def from_rad(motion: Motion, unit: str, joint_range: Float[np.ndarray, "joints 2"]) -> Motion:
+    """The motion with angles from rad in a unit, and velocities in this unit per second; see `in_rad`."""
+    scale, offset = _scale_and_offset(unit, joint_range)
+    return motion._replace(
+        qpos=(motion.qpos - offset) / scale, qvel=None if motion.qvel is None else motion.qvel / scale
+    )
+
+
+def _scale_and_offset(unit: str, joint_range: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What turns a unit into rad: the factor of each joint, and what is added then."""
+    if unit != "percent":
+        return np.full(len(joint_range), _SCALE[unit]), np.zeros(len(joint_range))
+    if np.any(np.ptp(joint_range, axis=1) >= FULL_TURN):
+        raise ValueError("units=percent: expected an arm whose joints all have limits, as with limits=hardware")
+    return np.ptp(joint_range, axis=1) / 200, joint_range.mean(axis=1)

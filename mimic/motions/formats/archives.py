@@ -29,7 +29,7 @@ def read_archive(path: Path, joints: Sequence[str]) -> Recording:
     qpos, qvel = content["qpos"], content.get("qvel")
     present = list(map(str, np.atleast_1d(content["joint_names"])))
     selection = select(str(path), {"qpos": present}, joints, "", "array")
-    angle_at, velocity_at = _addresses(content.get("jnt_type"), present)
+    angle_at, velocity_at = addresses(content.get("jnt_type"), present)
     for key, values, width in (("qpos", qpos, angle_at[-1]), ("qvel", qvel, velocity_at[-1])):
         if values is not None and values.shape != (len(qpos), width):
             expected = [len(qpos), int(width)]
@@ -60,7 +60,7 @@ def read_archive(path: Path, joints: Sequence[str]) -> Recording:
         f"motion {number}": motion.take(slice(start, end))
         for number, (start, end) in enumerate(zip(bounds[:-1], bounds[1:], strict=True))
     }
-    return Recording(motions, tuple(selection.gripper), notes=tuple(selection.notes))
+    return Recording(motions, notes=tuple(selection.notes), **selection.facts)
 
 
 def _npz_content(path: Path) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def _npz_content(path: Path) -> dict[str, Any]:
     return content
 
 
-def _addresses(types: np.ndarray | None, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+def addresses(types: np.ndarray | None, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """First column of each joint in qpos and in qvel; the last entry is the number of columns."""
     kinds = [3] * len(names) if types is None else [int(kind) for kind in types[: len(names) + 1]]
     if len(kinds) != len(names) or any(kind not in _SIZES for kind in kinds):

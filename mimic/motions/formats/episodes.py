@@ -60,6 +60,9 @@ class Recording(NamedTuple):
       unit: of the angles: a value of `UNITS`; empty where the source does not state one.
       robot: the robot's type, of a source that may be in any of these units; None where others than rad are unusual.
       notes: lines about what was assumed, changed or left out.
+      entry: what has the angles: the topic, feature, data set or array.
+      joints: the source's names of the joints, base to tip.
+      commanded: other entries that have the same joints, as they were commanded.
     """
 
     motions: dict[str, Motion]
@@ -67,6 +70,9 @@ class Recording(NamedTuple):
     unit: str = ""
     robot: str | None = None
     notes: tuple[str, ...] = ()
+    entry: str = ""
+    joints: tuple[str, ...] = ()
+    commanded: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

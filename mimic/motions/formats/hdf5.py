@@ -18,14 +18,14 @@ SUFFIXES = (".hdf5", ".h5")
 _EPISODE = re.compile(r"(demo|traj|trajectory|episode|ep|rollout|run)_?\d+", re.IGNORECASE)
 _ANGLES = re.compile(r"(.*_)?(qpos|q|joint_?(pos|positions?|states?|angles?|qpos))|gripper_(states?|positions?|width)")
 _VELOCITIES = {"qpos": "qvel", "positions": "velocities", "position": "velocity", "pos": "vel"}  # names' ends
-_STATES, _MODEL = "states", "model_file"  # robosuite's: MuJoCo's time, qpos and qvel, and the model that they are of
-_OTHER_COPIES = "next_obs"  # robomimic's: the observations of the next sample
+STATES, MODEL = "states", "model_file"  # robosuite's: MuJoCo's time, qpos and qvel, and the model that they are of
+OTHER_COPIES = "next_obs"  # robomimic's: the observations of the next sample
 _RATES = ("control_freq", "fps", "frequency", "hz", "rate")  # attributes; in Hz
 _ENVIRONMENTS = ("env_args", "env_info", "env_kwargs")  # attributes with such keys, as JSON
 _SIZES = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}  # of qpos and qvel, by MuJoCo's joints
 
 
-class _Episode(NamedTuple):
+class Episode(NamedTuple):
     """An episode: its group, its data sets by their path within it, and the attributes from the file's to its own."""
 
     group: Any
@@ -42,7 +42,7 @@ class _Layout(NamedTuple):
 
 def is_hdf5(path: Path) -> bool:
     """Whether a path is an HDF5 file or a folder with such files."""
-    return bool(_files(path))
+    return bool(files_of(path))
 
 
 def read_hdf5(path: Path, joints: Sequence[str], entry: str = "", rate: float | None = None) -> Recording:
@@ -67,18 +67,18 @@ def read_hdf5(path: Path, joints: Sequence[str], entry: str = "", rate: float | 
     except ImportError as error:
         raise package_error(f"source: {str(path)!r} is an HDF5 file, which", "h5py") from error
     motions: dict[str, Motion] = {}
-    selection, numbers, files = None, 0, _files(path)
+    selection, numbers, files = None, 0, files_of(path)
     for file in files:
         try:
             with h5py.File(check_file(file, None), "r") as content:
-                for name, episode in _episodes(content):
+                for name, episode in episodes(content):
                     layout = _layout(file, episode)
                     selection = selection or select(str(path), _entries(episode, layout), joints, entry, "data set")
                     motion = _motion(episode, layout, selection, rate)
                     numbers += motion.qpos.size
                     if numbers > MAX_NUMBERS:
                         raise ValueError(f"expected at most {MAX_NUMBERS:,} numbers")
-                    motions[" ".join(filter(None, (file.stem if len(files) > 1 else "", name)))] = motion
+                    motions[episode_label(file, name, len(files))] = motion
         except (OSError, KeyError, RuntimeError, TypeError, ValueError, ElementTree.ParseError) as error:
             line = " ".join(str(error).split())[:400]
             raise ValueError(
@@ -86,16 +86,22 @@ def read_hdf5(path: Path, joints: Sequence[str], entry: str = "", rate: float | 
             ) from error
     if selection is None:
         raise ValueError(f"source: {str(path)!r} has no data sets of angles")
-    return Recording(motions, tuple(selection.gripper), notes=tuple(selection.notes))
+    return Recording(motions, notes=tuple(selection.notes), **selection.facts)
 
 
-def _files(path: Path) -> list[Path]:
+def episode_label(file: Path, name: str, files: int) -> str:
+    """The name of the motion of an episode, of one of some files."""
+    return " ".join(filter(None, (file.stem if files > 1 else "", name)))
+
+
+def files_of(path: Path) -> list[Path]:
+    """The HDF5 files that a path names: itself, or those in it."""
     if path.is_dir():
         return sorted(file for file in path.iterdir() if file.suffix in SUFFIXES)
     return [path] if path.suffix in SUFFIXES and path.is_file() else []
 
 
-def _episodes(file: Any) -> Iterator[tuple[str, _Episode]]:
+def episodes(file: Any) -> Iterator[tuple[str, Episode]]:
     """The episodes of a file by name, in the order of their numbers; only data that the file itself holds."""
     sets: dict[str, dict[str, Any]] = {}
 
@@ -106,7 +112,7 @@ def _episodes(file: Any) -> Iterator[tuple[str, _Episode]]:
             raise ValueError(f"{name} is stored in another file")
         parts = name.split("/")
         depth = next((index + 1 for index, part in enumerate(parts) if _EPISODE.fullmatch(part)), 0)
-        if parts[depth] != _OTHER_COPIES:
+        if parts[depth] != OTHER_COPIES:
             sets.setdefault("/".join(parts[:depth]), {})["/".join(parts[depth:])] = item
 
     file.visititems(visit)
@@ -117,35 +123,36 @@ def _episodes(file: Any) -> Iterator[tuple[str, _Episode]]:
             file,
             *(file["/".join(name.split("/")[: depth + 1])] for depth in range(name.count("/") + 1) if name),
         ]
-        yield name.split("/")[-1], _Episode(group, in_episodes[name], [parent.attrs for parent in parents])
+        yield name.split("/")[-1], Episode(group, in_episodes[name], [parent.attrs for parent in parents])
 
 
-def _entries(episode: _Episode, layout: _Layout | None) -> dict[str, list[str]]:
+def _entries(episode: Episode, layout: _Layout | None) -> dict[str, list[str]]:
     """The data sets of angles with the names of their columns: numbers from 1, where nothing names them."""
     entries = {
         name: [str(number) for number in range(1, (item.shape[1] if item.ndim == 2 else 1) + 1)]
         for name, item in episode.sets.items()
         if _ANGLES.fullmatch(name.split("/")[-1])
     }
-    return entries | ({_STATES: list(layout.qpos)} if layout else {})
+    return entries | ({STATES: list(layout.qpos)} if layout else {})
 
 
-def _motion(episode: _Episode, layout: _Layout | None, selection: Selection, rate: float | None) -> Motion:
+def _motion(episode: Episode, layout: _Layout | None, selection: Selection, rate: float | None) -> Motion:
     """The motion of an episode."""
     samples = _columns(episode.sets[selection.entry])
     gripper = None
-    if selection.entry == _STATES and layout:
+    if selection.entry == STATES and layout:
         qpos = samples[:, [layout.qpos[name] for name in selection.joints]]
         qvel = samples[:, [layout.qvel[name] for name in selection.joints]]
     else:
         qpos = samples[:, [int(name) - 1 for name in selection.joints]]
-        of_velocities = _velocities(episode, selection.entry)
-        qvel = None if of_velocities is None else of_velocities[:, [int(name) - 1 for name in selection.joints]]
+        of_velocities = velocities_entry(episode, selection.entry)
+        samples = _columns(episode.sets[of_velocities]) if of_velocities else None
+        qvel = None if samples is None else samples[:, [int(name) - 1 for name in selection.joints]]
     if selection.gripper:
         channels = _columns(episode.sets[selection.gripper_entry])
-        at = layout.qpos if selection.gripper_entry == _STATES and layout else None
+        at = layout.qpos if selection.gripper_entry == STATES and layout else None
         gripper = channels[:, [at[name] if at else int(name) - 1 for name in selection.gripper]]
-    return Motion(_times(episode, samples, layout, rate), qpos, qvel, gripper)
+    return Motion(_times(episode, len(qpos), layout, rate), qpos, qvel, gripper)
 
 
 def _columns(item: Any) -> np.ndarray:
@@ -154,19 +161,16 @@ def _columns(item: Any) -> np.ndarray:
     return np.asarray(item[()], float).reshape(len(item), -1)
 
 
-def _velocities(episode: _Episode, entry: str) -> np.ndarray | None:
-    """The data set beside that of the angles that has their velocities."""
-    for end, other in _VELOCITIES.items():
-        if entry.endswith(end) and (name := entry.removesuffix(end) + other) in episode.sets:
-            return _columns(episode.sets[name])
-    return None
+def velocities_entry(episode: Episode, entry: str) -> str:
+    """The data set beside that of the angles that has their velocities; empty for none."""
+    names = (entry.removesuffix(end) + other for end, other in _VELOCITIES.items() if entry.endswith(end))
+    return next((name for name in names if name in episode.sets), "")
 
 
-def _times(episode: _Episode, samples: np.ndarray, layout: _Layout | None, rate: float | None) -> np.ndarray:
+def _times(episode: Episode, count: int, layout: _Layout | None, rate: float | None) -> np.ndarray:
     """The times of samples [s]: what the user states, or the file's."""
-    count = len(samples)
     if rate is None and layout:
-        states = _columns(episode.sets[_STATES])[:, 0]
+        states = _columns(episode.sets[STATES])[:, 0]
         if len(states) == count and np.all(np.diff(states) > 0):
             return states
     for name, item in episode.sets.items() if rate is None else ():
@@ -190,11 +194,11 @@ def _rates(attributes: Mapping[str, Any]) -> Iterator[float]:
                 yield from (float(settings[rate]) for rate in _RATES if isinstance(settings.get(rate), int | float))
 
 
-def _layout(file: Path, episode: _Episode) -> _Layout | None:
+def _layout(file: Path, episode: Episode) -> _Layout | None:
     """The columns of an episode's states, from its model; None without one."""
-    if _STATES not in episode.sets or _MODEL not in episode.group.attrs:
+    if STATES not in episode.sets or MODEL not in episode.group.attrs:
         return None
-    text = _text(episode.group.attrs[_MODEL])
+    text = _text(episode.group.attrs[MODEL])
     if not text.lstrip().startswith("<"):
         text = read_text(file.parent / Path(text).name)  # beside the file: robosuite 1.0
     if "<!" in text.replace("<!--", ""):
@@ -212,8 +216,8 @@ def _layout(file: Path, episode: _Episode) -> _Layout | None:
             sizes.append(_SIZES[str(kind)])
     ends = np.cumsum(sizes, axis=0).reshape(-1, 2)
     starts, width = ends - np.reshape(sizes, (-1, 2)), 1 + int(ends[-1].sum() if len(ends) else 0)
-    if episode.sets[_STATES].ndim != 2 or episode.sets[_STATES].shape[1] < width:
-        raise ValueError(f"states: expected {width} columns for the model, got {list(episode.sets[_STATES].shape)}")
+    if episode.sets[STATES].ndim != 2 or episode.sets[STATES].shape[1] < width:
+        raise ValueError(f"states: expected {width} columns for the model, got {list(episode.sets[STATES].shape)}")
     qvel = 1 + int(ends[-1, 0]) if len(ends) else 1
     return _Layout(
         {name: 1 + int(start) for name, (start, _) in zip(names, starts, strict=True)},

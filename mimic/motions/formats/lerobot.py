@@ -64,7 +64,7 @@ def write_lerobot(folder: Path, episodes: Episodes) -> None:
         pq.write_table(table, _new_file(folder / DATA_FOLDER, file))
     pq.write_table(_episode_table(episodes, arrays, starts, ends, files), _new_file(folder / EPISODES_FOLDER, 0))
     pq.write_table(_task_table([episodes.task]), folder / TASKS)
-    stats = {name: _statistics(array) for name, array in arrays.items()}
+    stats = {name: statistics(array) for name, array in arrays.items()}
     info = {
         "codebase_version": VERSION,
         "robot_type": episodes.robot.arm,
@@ -172,7 +172,7 @@ def _episode_table(
         {
             f"stats/{name}/{key}": value
             for name, array in arrays.items()
-            for key, value in _statistics(array[start:end]).items()
+            for key, value in statistics(array[start:end]).items()
         }
         for start, end in zip(starts, ends, strict=True)
     ]
@@ -215,7 +215,7 @@ def _task_table(tasks: Sequence[str]) -> Any:
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
-def _statistics(values: np.ndarray) -> dict[str, list[Any]]:
+def statistics(values: np.ndarray) -> dict[str, list[Any]]:
     """Statistics of a feature over frames, in double precision; the standard deviation is that of the values."""
     exact = values.astype(np.float64)
     quantiles = np.percentile(exact, _QUANTILES, axis=0)

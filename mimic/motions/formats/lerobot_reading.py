@@ -67,10 +67,10 @@ def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> Record
     beside = selection.gripper_entry or selection.entry
     episode, frame, time, values, of_gripper = _read_frames(path, (selection.entry, beside))
     order = np.lexsort((frame, episode))
-    numbers, starts = np.unique(episode[order], return_index=True)
+    present, starts = np.unique(episode[order], return_index=True)
     final = _final_values(path, selection.entry)
     motions, notes = {}, list(selection.notes)
-    for number, rows in zip(numbers, np.split(order, starts[1:]), strict=True):
+    for number, rows in zip(present, np.split(order, starts[1:]), strict=True):
         times, line = _times(frame[rows], time[rows], fps)
         notes += [line] if line and line not in notes else []
         samples, gripper = values[rows], of_gripper[rows]
@@ -82,7 +82,7 @@ def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> Record
         opening = _select(gripper, features[beside].columns[ANGLE], selection.gripper) if selection.gripper else None
         motions[f"episode {number}"] = Motion(times, qpos, qvel, opening)
     robot = str(info.get("robot_type") or "")
-    return Recording(motions, tuple(selection.gripper), chosen.unit, robot, tuple(notes))
+    return Recording(motions, unit=chosen.unit, robot=robot, notes=tuple(notes), **selection.facts)
 
 
 def _check_info(info: Mapping[str, Any]) -> float:
@@ -102,7 +102,7 @@ def _features(features: Mapping[str, Any]) -> dict[str, _Feature]:
     entries: dict[str, _Feature] = {}
     for feature, form in features.items():
         size: list[Any] = list(form.get("shape") or ())
-        names = _names(form.get("names"), size)
+        names = feature_names(form)
         if form.get("dtype") not in _FLOATS or size != [len(names)] or str(feature).startswith(_NO_JOINTS):
             continue
         columns: dict[Quantity, dict[str, int]] = {ANGLE: {}, VELOCITY: {}}
@@ -115,8 +115,10 @@ def _features(features: Mapping[str, Any]) -> dict[str, _Feature]:
     return entries
 
 
-def _names(names: Any, shape: list[int]) -> list[str]:
+def feature_names(form: Mapping[str, Any]) -> list[str]:
     """Names of the columns of a feature, as datasets have them: a list, in a mapping or a list of one, or none."""
+    names: Any = form.get("names")
+    shape: list[Any] = list(form.get("shape") or ())
     if isinstance(names, Mapping) and all(isinstance(index, int) for index in names.values()):
         names = sorted(names, key=names.get)  # type: ignore[arg-type]
     elif isinstance(names, Mapping | list | tuple) and len(names) == 1 and len(shape) == 1:
@@ -156,7 +158,7 @@ def _read_frames(path: Path, features: Sequence[str]) -> tuple[np.ndarray, ...]:
         if not 0 < count <= MAX_NUMBERS:
             raise ValueError(f"expected 1 to {MAX_NUMBERS:,} numbers, got {count:,}")
         tables = [pq.ParquetFile(file).read(columns=list(dict.fromkeys(names))) for file in files]
-        columns = [np.concatenate([_numbers(table[name]) for table in tables]) for name in names]
+        columns = [np.concatenate([numbers(table[name]) for table in tables]) for name in names]
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:
         raise ValueError(f"source: the data of {str(path)!r} cannot be read: {_line(error)}") from error
     episode, frame, time, *values = columns
@@ -184,14 +186,14 @@ def _final_values(path: Path, feature: str) -> dict[int, np.ndarray]:
         for file in sorted((path / EPISODES_FOLDER).glob("*/*.parquet")):
             if FINAL + feature in pq.read_schema(check_file(file)).names:
                 table = pq.ParquetFile(file).read(columns=["episode_index", FINAL + feature])
-                values = _numbers(table[FINAL + feature]).reshape(table.num_rows, -1)
+                values = numbers(table[FINAL + feature]).reshape(table.num_rows, -1)
                 final |= dict(zip(table["episode_index"].to_pylist(), values, strict=True))
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:
         raise ValueError(f"source: the episodes of {str(path)!r} cannot be read: {_line(error)}") from error
     return final
 
 
-def _numbers(column: Any) -> np.ndarray:
+def numbers(column: Any) -> np.ndarray:
     """A column of numbers, or of lists of numbers, as one array; lists are [rows, numbers]."""
     import pyarrow as pa
 

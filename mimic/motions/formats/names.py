@@ -3,7 +3,7 @@
 import os
 import re
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mimic.motions.formats.episodes import ANGLE, TORQUE, VELOCITY, Quantity
 
@@ -52,6 +52,7 @@ class Selection(NamedTuple):
       gripper: those of the gripper's joints or opening.
       gripper_entry: the entry that has these; empty without a gripper.
       notes: what was assumed to find them.
+      commanded: other entries that have the joints, as they were commanded; none where the user names the entry.
     """
 
     entry: str
@@ -59,6 +60,13 @@ class Selection(NamedTuple):
     gripper: list[str]
     gripper_entry: str
     notes: list[str]
+    commanded: list[str]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What a `Recording` says about its columns."""
+        return {"gripper": tuple(self.gripper), "entry": self.entry, "joints": tuple(self.joints),
+                "commanded": tuple(self.commanded)}  # fmt: skip
 
 
 def parse_column(text: str) -> Column:
@@ -123,6 +131,14 @@ def _counted(by_key: Mapping[str, str], count: int) -> dict[str, list[str]]:
     }  # fmt: skip
 
 
+def numbers_joints(names: Sequence[str]) -> bool:
+    """Whether a source numbers joints, rather than naming them: `1`, `actual 0`, but not `joint1`."""
+    bare = [_COUNTED.fullmatch(_key(name)) for name in names]
+    return all(match and (not match[1] or match[1] in _WHOSE) for match in bare) and not any(
+        _key(name).startswith("joint") for name in names
+    )
+
+
 def select(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str], entry: str, kind: str) -> Selection:
     """Finds the columns of an arm: in the entry that is named, or in the only one that has all joints.
 
@@ -168,7 +184,9 @@ def select(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str
     gripper, gripper_entry = _gripper(entries, name, columns)
     if gripper and gripper_entry == name and all(column.isdigit() for column in gripper):
         notes.append(f"gripper: {', '.join(gripper)}, after the joints")
-    return Selection(name, columns, gripper, gripper_entry, notes)
+    commanded = [] if entry else [other for other in considered if other != name and is_command(other)]
+    commanded = [other for other in commanded if find_joints(entries[other], joints)]
+    return Selection(name, columns, gripper, gripper_entry, notes, commanded)
 
 
 def is_command(entry: str) -> bool:

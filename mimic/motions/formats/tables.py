@@ -7,8 +7,10 @@ import zlib
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from mimic.base.files import MAX_BYTES, open_file, read_text
 from mimic.motions.formats.episodes import ANGLE, VELOCITY, Motion, Quantity, Recording
@@ -19,6 +21,40 @@ TIMES = ("time", "times", "t", "timestamp", "timestamps", "stamp", "elapsed", "s
 _DEMONSTRATIONS = ("demonstration", "demo", "episode", "episode_index", "trajectory", "trial")
 _CLOCKS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # units of times that large: a clock's, since 1970
 _SLOWEST = 0.99  # s between samples: with more, they are in another unit, or no motion
+
+
+class Cells(NamedTuple):
+    """The text of a table.
+
+    Attributes:
+      comments: lines of comments, without those of the header.
+      header: names of columns; empty where there are none.
+      rows: lines below the header.
+      separator: between cells; None for blanks.
+      table: [rows, columns] their numbers; NaN for empty cells and words.
+    """
+
+    comments: list[str]
+    header: list[str]
+    rows: list[str]
+    separator: str | None
+    table: Float[np.ndarray, "rows columns"]
+
+    def cells(self, row: str) -> list[str]:
+        """The texts of the cells in a row."""
+        return split_cells(row, self.separator)
+
+
+class _Content(NamedTuple):
+    """Names of columns, what they are, numbers, places of time and number, motion of each row, and assumptions."""
+
+    names: list[str]
+    columns: list[Column]
+    table: np.ndarray
+    time_at: int | None
+    number_at: int | None
+    episodes: list[str]
+    notes: list[str]
 
 
 def read_table(path: Path, joints: Sequence[str], rate: float | None = None) -> Recording:
@@ -37,23 +73,20 @@ def read_table(path: Path, joints: Sequence[str], rate: float | None = None) -> 
     Raises:
       ValueError: no table of numbers, or one that lacks columns.
     """
-    header, table = _read_cells(path)
-    columns, notes = [parse_column(name) for name in header], []
-    if not header:
-        columns, notes = _default_columns(path, table.shape[1], len(joints), not rate)
+    text = read_cells(path)
+    content = _content(path, text, len(joints), not rate)
+    columns, table, notes = content.columns, content.table, content.notes
+    time_at, number_at = content.time_at, content.number_at
     names = {
         quantity: {column.joint: i for i, column in enumerate(columns) if column.quantity == quantity}
         for quantity in (ANGLE, VELOCITY)
     }
-    time_at, number_at = (
-        next((i for i, column in enumerate(columns) if _word(column.joint) in words), None)
-        for words in (TIMES, _DEMONSTRATIONS)
-    )
     reserved = [column.joint for i, column in enumerate(columns) if i in (time_at, number_at)]
     angles = {name: index for name, index in names[ANGLE].items() if name not in reserved}
     if time_at is None and not rate:
         raise ValueError(
-            f"source: {str(path)!r} lacks time; got the columns {', '.join(header)}; rate= states samples per second"
+            f"source: {str(path)!r} lacks time; got the columns {', '.join(text.header)}; rate= states samples per "
+            "second"
         )
     if not len(table):
         raise ValueError(f"source: {str(path)!r} has no rows")
@@ -67,16 +100,38 @@ def read_table(path: Path, joints: Sequence[str], rate: float | None = None) -> 
     qvel = _velocities(path, table, names[VELOCITY], selection)
     gripper = table[:, [angles[name] for name in selection.gripper]] if selection.gripper else None
     motion = Motion(time, table[:, [angles[name] for name in selection.joints]], qvel, gripper)
-    numbers = np.zeros(len(table)) if number_at is None else table[:, number_at]
-    motions = {f"demonstration {number:g}": motion.take(numbers == number) for number in np.unique(numbers)}
+    labels = np.array(content.episodes)
+    motions = {label: motion.take(labels == label) for label in dict.fromkeys(content.episodes)}
     unit = next(filter(None, (columns[angles[name]].unit for name in selection.joints)), "")
     lines = (*notes, *selection.notes, *filter(None, [line]))
-    return Recording(motions, tuple(selection.gripper), unit, notes=lines)
+    return Recording(motions, unit=unit, notes=lines, **selection.facts)
+
+
+def rows_of_table(path: Path, joints: int, timed: bool) -> tuple["Cells", list[str], list[str]]:
+    """A table's text, the names of its columns, and the motion to which each row belongs; see `read_table`."""
+    text = read_cells(path)
+    content = _content(path, text, joints, timed)
+    return text, content.names, content.episodes
+
+
+def _content(path: Path, text: "Cells", joints: int, timed: bool) -> "_Content":
+    """The numbers of a table, and what its columns are."""
+    names, notes = text.header, []
+    if not names:
+        names, notes = _default_names(path, text.table.shape[1], joints, timed)
+    columns = [parse_column(name) for name in names]
+    time_at, number_at = (
+        next((i for i, column in enumerate(columns) if _word(column.joint) in words), None)
+        for words in (TIMES, _DEMONSTRATIONS)
+    )
+    numbers = np.zeros(len(text.table)) if number_at is None else text.table[:, number_at]
+    episodes = [f"demonstration {number:g}" for number in numbers]
+    return _Content(names, columns, text.table, time_at, number_at, episodes, notes)
 
 
 def is_folder_of_tables(path: Path) -> bool:
     """Whether a folder has tables of angles and of times, one for each quantity, as their names say."""
-    return {"time", ANGLE} <= set(_tables_by_quantity(path)) if path.is_dir() else False
+    return {"time", ANGLE} <= set(tables_by_quantity(path)) if path.is_dir() else False
 
 
 def read_folder_of_tables(folder: Path, joints: Sequence[str]) -> Recording:
@@ -88,12 +143,12 @@ def read_folder_of_tables(folder: Path, joints: Sequence[str]) -> Recording:
     Raises:
       ValueError: tables of other sizes.
     """
-    tables = {quantity: _read_cells(path) for quantity, path in _tables_by_quantity(folder).items()}
-    count, notes = tables["time"][1].size, []
+    tables = {quantity: read_cells(path).table for quantity, path in tables_by_quantity(folder).items()}
+    count, notes = tables["time"].size, []
     arrays: dict[Quantity, np.ndarray] = {}
     for quantity in (ANGLE, VELOCITY):
         if quantity in tables:
-            table = tables[quantity][1]
+            table = tables[quantity]
             if table.size != count * len(joints):
                 raise ValueError(
                     f"source: {str(folder)!r} has {count} times and {table.size} numbers as {quantity.name}, "
@@ -101,12 +156,13 @@ def read_folder_of_tables(folder: Path, joints: Sequence[str]) -> Recording:
                 )
             arrays[quantity] = table.reshape(count, len(joints))
     notes.append(f"joints: the numbers of a sample in their order, as {', '.join(joints)}")
-    time, line = seconds(folder, tables["time"][1].ravel(), "")
+    time, line = seconds(folder, tables["time"].ravel(), "")
     motion = Motion(time, arrays[ANGLE], arrays.get(VELOCITY))
-    return Recording({"demonstration 0": motion}, notes=(*notes, *filter(None, [line])))
+    lines = (*notes, *filter(None, [line]))
+    return Recording({"demonstration 0": motion}, notes=lines, entry=ANGLE.name, joints=tuple(joints))
 
 
-def _tables_by_quantity(folder: Path) -> dict[Quantity | str, Path]:
+def tables_by_quantity(folder: Path) -> dict[Quantity | str, Path]:
     """The tables of a folder by quantity, or "time"; none where two have the same."""
     found: dict[Quantity | str, Path] = {}
     for path in sorted(folder.iterdir()):
@@ -119,21 +175,27 @@ def _tables_by_quantity(folder: Path) -> dict[Quantity | str, Path]:
     return found
 
 
-def _read_cells(path: Path) -> tuple[list[str], np.ndarray]:
-    """The header of a table, empty where it has none, and its numbers [rows, columns]; empty cells are NaN."""
+def read_cells(path: Path) -> Cells:
+    """The text of a table, and its numbers.
+
+    Raises:
+      ValueError: it is no table of numbers below a header.
+    """
     try:
         lines = [line for line in _text(path).splitlines() if line.strip(" ,;\t")]
-        comments = [line.lstrip("#% ") for line in lines if line.lstrip().startswith(("#", "%"))]
+        comments = [line for line in lines if line.lstrip().startswith(("#", "%"))]
         lines = [line for line in lines if not line.lstrip().startswith(("#", "%"))]
         if not lines:
             raise ValueError("it has no rows")
         separator = next((mark for mark in ";\t," if mark in lines[0]), None)
-        header, rows = _cells(lines[0], separator), lines[1:]
+        header, rows = split_cells(lines[0], separator), lines[1:]
         if _are_numbers(header, separator):
-            header, rows = _cells(comments[-1], separator) if comments else [], lines
-            if _are_numbers(header, separator) or len(header) != len(_cells(lines[0], separator)):
+            header, rows = split_cells(comments[-1].lstrip("#% "), separator) if comments else [], lines
+            if _are_numbers(header, separator) or len(header) != len(split_cells(lines[0], separator)):
                 header = []
-        return header, _numbers(rows, separator).reshape(len(rows), len(header) or -1)
+            comments = comments[: len(comments) - bool(header)]
+        table = _numbers(rows, separator).reshape(len(rows), len(header) or -1)
+        return Cells(comments, header, rows, separator, table)
     except (OSError, EOFError, ValueError, zlib.error) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"source: {str(path)!r} is no table of numbers below a header: {reason}") from error
@@ -148,7 +210,7 @@ def _numbers(rows: list[str], separator: str | None) -> np.ndarray:
     try:
         return np.loadtxt(rows, delimiter=separator, comments=None, ndmin=2) if rows else np.zeros((0, 0))
     except ValueError:
-        table = [_cells(row, separator) for row in rows]
+        table = [split_cells(row, separator) for row in rows]
     for number, row in enumerate(table, start=1):
         if len(row) != len(table[0]):
             raise ValueError(f"row {number} has {len(row)} cells, expected {len(table[0])}")
@@ -182,7 +244,8 @@ def _text(path: Path) -> str:
     return content.decode("utf-8-sig")
 
 
-def _cells(line: str, separator: str | None) -> list[str]:
+def split_cells(line: str, separator: str | None) -> list[str]:
+    """The texts of the cells of a line."""
     return [cell.strip().strip('"').strip() for cell in line.split(separator)]
 
 
@@ -198,8 +261,8 @@ def _are_numbers(cells: Sequence[str], separator: str | None) -> bool:
     return None not in [_number(cell, separator) for cell in cells]
 
 
-def _default_columns(path: Path, count: int, joints: int, timed: bool) -> tuple[list[Column], list[str]]:
-    """The columns of a table without a header: time, angles, and as many velocities and torques as there are."""
+def _default_names(path: Path, count: int, joints: int, timed: bool) -> tuple[list[str], list[str]]:
+    """Columns of a table without a header (time, angles, and the velocities and torques that there are), and a line."""
     blocks = {1: "angles", 2: "angles and velocities", 3: "angles, velocities and torques"}
     quantities = blocks.get((count - timed) // joints)
     if (count - timed) % joints or not quantities:
@@ -210,7 +273,7 @@ def _default_columns(path: Path, count: int, joints: int, timed: bool) -> tuple[
     names = [f"{word}_{number + 1}" for word in ("q", "dq", "tau") for number in range(joints)]
     names = ["time", *names] if timed else names
     note = f"no header: the columns are {'time, then ' * timed}the {quantities} of {joints} joints"
-    return [parse_column(name) for name in names[:count]], [note]
+    return names[:count], [note]
 
 
 def _word(name: str) -> str:

@@ -1,0 +1,177 @@
+"""Reads a data set of one arm whole, and writes it again with another arm's motions in place of the first one's."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from mimic.arms.embodiment import Embodiment
+from mimic.motions.cleaning import Notes, cleaned
+from mimic.motions.formats.episodes import Motion, Recording
+from mimic.motions.formats.hdf5 import is_hdf5
+from mimic.motions.formats.hdf5_rewriting import rewrite_hdf5
+from mimic.motions.formats.lerobot_reading import is_lerobot
+from mimic.motions.formats.lerobot_rewriting import rewrite_lerobot
+from mimic.motions.formats.replacing import Replacement
+from mimic.motions.formats.table_rewriting import rewrite_archive, rewrite_folder_of_tables, rewrite_table
+from mimic.motions.formats.tables import TABLES, is_folder_of_tables
+from mimic.motions.importing import read_source, source_names
+from mimic.motions.units import find_unit, from_rad, in_rad
+
+
+@dataclasses.dataclass(frozen=True)
+class DataSet:
+    """A data set of an arm, sample by sample.
+
+    Attributes:
+      path: of the source.
+      entry: what has the measured angles.
+      motions: by entry and episode: of the arm as measured, and as commanded [rad].
+      joints: the source's names of the arm's joints, by entry.
+      faults: why an episode cannot be retargeted, by its name.
+      gripper: names of the gripper's channels.
+      unit: of the source's angles.
+      timed: whether the source has times.
+      notes: what was assumed.
+    """
+
+    path: Path
+    entry: str
+    motions: Mapping[str, Mapping[str, Motion]]
+    joints: Mapping[str, tuple[str, ...]]
+    faults: Mapping[str, str]
+    gripper: tuple[str, ...]
+    unit: str
+    timed: bool
+    notes: tuple[str, ...]
+
+    @property
+    def measured(self) -> Mapping[str, Motion]:
+        """The motions of the arm as measured, by episode."""
+        return self.motions[self.entry]
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """The entries with what was commanded."""
+        return tuple(entry for entry in self.motions if entry != self.entry)
+
+
+def read_data_set(
+    path: Path,
+    arm: Embodiment,
+    *,
+    joints: Sequence[str] = (),
+    topic: str = "",
+    units: str = "",
+    rate: float | None = None,
+) -> DataSet:
+    """Reads the motions of an arm with all their samples; see `read_recording` for the arguments.
+
+    An episode that would have to be repaired, such as one in which a joint jumps, has a fault.
+
+    Raises:
+      ValueError: what `read_recording` rejects; all episodes have faults.
+    """
+    names = source_names(arm, joints)
+    recording = read_source(path, names, topic, rate)
+    ranges = np.asarray(arm.joint_range, float)
+    unit, line = find_unit(str(path), recording, arm.joint_names, ranges, units)
+    entry = recording.entry
+    recordings = {entry: recording} | {name: read_source(path, names, name, rate) for name in recording.commanded}
+    joint_names = {name: found.joints for name, found in recordings.items()}
+    motions, faults = _whole(in_rad(recording, unit, ranges), arm, ranges)
+    if not motions:
+        raise ValueError(next(iter(faults.values())))
+    every = {entry: motions}
+    for name in recording.commanded:
+        found = in_rad(recordings[name], unit, ranges).motions
+        every[name] = {episode: _near(found[episode], motion) for episode, motion in motions.items()}
+    notes = tuple(note for note in (*recording.notes, line) if note)
+    return DataSet(path, entry, every, joint_names, faults, recording.gripper, unit, rate is None, notes)
+
+
+def _whole(recording: Recording, arm: Embodiment, ranges: np.ndarray) -> tuple[dict[str, Motion], dict[str, str]]:
+    """The motions that need no repair, with angles within the range, and what is wrong with the others."""
+    motions, faults = {}, {}
+    for name, motion in recording.motions.items():
+        notes = Notes()
+        try:
+            parts = list(cleaned(name, motion, arm.joint_names, ranges, notes).values())
+        except ValueError as error:
+            faults[name] = str(error).removeprefix("source: ")
+            continue
+        if len(parts) == 1 and len(parts[0].time) == len(motion.time):
+            motions[name] = parts[0]
+        else:
+            faults[name] = "; ".join(notes.lines())
+    return motions, faults
+
+
+def _near(command: Motion, motion: Motion) -> Motion:
+    """The commanded angles without full turns to the measured ones."""
+    difference = command.qpos - motion.qpos
+    return motion._replace(qpos=command.qpos - 2 * np.pi * np.round(difference / (2 * np.pi)))
+
+
+def write_data_set(
+    data: DataSet,
+    out: Path,
+    learner: Embodiment,
+    motions: Mapping[str, Mapping[str, Motion]],
+    kept: Sequence[str],
+    joint_range: Float[np.ndarray, "joints 2"],
+) -> list[str]:
+    """Writes the data set into an empty folder with the learner's motions, in the format and the unit of the source.
+
+    Args:
+      data: the data set of the expert.
+      out: the folder.
+      learner: whose names stand in the data set.
+      motions: the learner's by entry and episode [rad], with as many samples as the expert's.
+      kept: the episodes to write.
+      joint_range: of the learner [rad], for units=percent.
+
+    Returns:
+      Lines about what is left out or has another place.
+    """
+    in_unit = {
+        entry: {name: from_rad(motion, data.unit, joint_range) for name, motion in found.items()}
+        for entry, found in motions.items()
+    }
+    replacement = Replacement(learner.name, learner.joint_names, data.joints, in_unit, list(kept))
+    if write := _writer(data):
+        lines = write(data.path, out, replacement)
+        return [line if ":" in line else f"left out, as it is not known of {learner.name}: {line}" for line in lines]
+    arrays = {"joint_names": np.array(learner.joint_names)}
+    chosen = [motions[data.entry][name] for name in kept]
+    arrays["qpos"] = np.concatenate([motion.qpos for motion in chosen])
+    arrays["qvel"] = np.concatenate([motion.qvel for motion in chosen])  # type: ignore[misc]
+    arrays["split_points"] = np.cumsum([0, *(len(motion.time) for motion in chosen)])
+    arrays["dt"] = np.array(np.median(np.concatenate([np.diff(motion.time) for motion in chosen])))
+    for entry in data.commands:
+        arrays[f"command_{entry.strip('/').replace('/', '_')}"] = np.concatenate(
+            [motions[entry][name].qpos for name in kept]
+        )
+    if data.gripper:
+        arrays["gripper"] = np.concatenate([data.measured[name].gripper for name in kept])  # type: ignore[misc]
+        arrays["gripper_names"] = np.array(data.gripper)
+    np.savez_compressed(out / "motions.npz", **arrays)
+    return [
+        "format: mimic does not write this one again; the motions are in motions.npz, in rad and without other columns"
+    ]
+
+
+def _writer(data: DataSet) -> Callable[[Path, Path, Replacement], list[str]] | None:
+    """What writes the format of a source; None where nothing does."""
+    path = data.path
+    if is_lerobot(path):
+        return rewrite_lerobot
+    if is_hdf5(path):
+        return rewrite_hdf5
+    if is_folder_of_tables(path):
+        return rewrite_folder_of_tables
+    if path.name.endswith(TABLES):
+        return lambda source, out, replacement: rewrite_table(source, out, replacement, data.timed)
+    return rewrite_archive if path.suffix == ".npz" else None

@@ -1,0 +1,257 @@
+"""Data sets written again for another arm: read back, its motions are the same, and so is all that is not the arm's."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import mimic
+from mimic.motions.formats.episodes import Motion
+from mimic.motions.formats.replacing import replaced_columns
+from mimic.motions.importing import read_source
+from mimic.motions.rewriting import read_data_set, write_data_set
+
+EXPERT = dataclasses.replace(mimic.planar_arm([0.3, 0.3, 0.2]), joint_range=np.array([[-2.0, 2.0]] * 3))
+LEARNER = dataclasses.replace(
+    mimic.planar_arm([0.4, 0.3, 0.2, 0.1]), name="learner", joint_names=("l1", "l2", "l3", "l4")
+)
+RATE, COUNTS = 20, (60, 50, 70)
+OLD, NEW = EXPERT.joint_names, LEARNER.joint_names
+RANGES = np.array([[-1.0, 3.0]] * 4)  # rad, of the learner's joints
+
+
+def expert_motion(count):
+    time = np.arange(count) / RATE
+    return time, 0.5 * np.sin(time[:, None] + np.arange(3))
+
+
+def rewrite(tmp_path, source, kept=None, **options):
+    """Writes a source again with made-up motions of the learner; returns the data set, these, the folder and lines."""
+    data = read_data_set(source, EXPERT, **options)
+    motions = {}
+    for shift, (entry, found) in enumerate(data.motions.items()):
+        motions[entry] = {}
+        for name, motion in found.items():
+            qpos = 0.3 + 0.1 * shift + np.c_[0.5 * motion.qpos, motion.qpos[:, :1] ** 2]
+            motions[entry][name] = Motion(motion.time, qpos, np.gradient(qpos, motion.time, axis=0), motion.gripper)
+    out = tmp_path / "out"
+    out.mkdir()
+    kept = list(data.measured) if kept is None else [list(data.measured)[index] for index in kept]
+    return data, motions, out, write_data_set(data, out, LEARNER, motions, kept, RANGES)
+
+
+# --- columns ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("names", "old", "expected"),
+    [
+        (["x", "a.pos", "b.pos", "a.vel", "b.vel", "jaw.pos"], ["a", "b"],
+         ["x", "l1.pos", "l2.pos", "l3.pos", "l1.vel", "l2.vel", "l3.vel", "jaw.pos"]),
+        (["time", "q_1", "q_2", "dq_1", "dq_2"], ["1", "2"], ["time", "q_1", "q_2", "q_3", "dq_1", "dq_2", "dq_3"]),
+        (["actual_q_0", "actual_q_1"], ["actual 0", "actual 1"], ["actual_q_0", "actual_q_1", "actual_q_2"]),
+        (["/js/joint1/position", "/js/joint2/position"], ["/js/joint1", "/js/joint2"], ["l1/position"]),
+        (["a [deg]", "b [deg]", "tau_a", "tau_b"], ["a", "b"], ["l1 [deg]", "l2 [deg]", "l3 [deg]"]),
+    ],
+)  # fmt: skip
+def test_columns_are_called_as_those_before(names, old, expected):
+    columns, dropped = replaced_columns(names, old, ["l1", "l2", "l3"])
+    found = [column.name for column in columns]
+    assert found[: len(expected)] == expected
+    assert dropped == [name for name in names if "tau" in name]
+
+
+# --- LeRobot ----------------------------------------------------------------------------------------------------------
+
+
+def lerobot(root, version):
+    """A data set in degrees with an action that leads, a gripper, a reward, a video file and statistics."""
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    names = [f"{name}.pos" for name in (*OLD, "gripper")]
+    features = {
+        "observation.state": {"dtype": "float32", "shape": [4], "names": {"motors": names}},
+        "action": {"dtype": "float32", "shape": [4], "names": names},
+        "next.reward": {"dtype": "float32", "shape": [1], "names": None},
+        "observation.images.front": {"dtype": "video", "shape": [4, 4, 3], "names": ["h", "w", "c"]},
+        **{name: {"dtype": "int64", "shape": [1], "names": None} for name in ("frame_index", "episode_index", "index")},
+        "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+    }
+    (root / "meta").mkdir(parents=True)
+    info = {"codebase_version": version, "robot_type": "old", "fps": RATE, "features": features, "total_episodes": 3,
+            "total_frames": sum(COUNTS), "splits": {"train": "0:2", "test": "2:3"}, "total_videos": 3}  # fmt: skip
+    (root / "meta/info.json").write_text(json.dumps(info))
+    tables = []
+    for episode, count in enumerate(COUNTS):
+        time, qpos = expert_motion(count)
+        state = np.degrees(np.c_[qpos, np.radians(50 + 40 * np.sin(3 * time))])
+        action = np.degrees(np.c_[qpos + 0.02, np.radians(50 + 40 * np.sin(3 * time))])
+        tables.append(pa.table({
+            "observation.state": pa.array(state.astype(np.float32).tolist(), pa.list_(pa.float32())),
+            "action": pa.array(action.astype(np.float32).tolist(), pa.list_(pa.float32())),
+            "next.reward": pa.array(np.arange(count, dtype=np.float32) + 100 * episode),
+            "frame_index": np.arange(count), "episode_index": np.full(count, episode),
+            "index": sum(COUNTS[:episode]) + np.arange(count), "timestamp": (time).astype(np.float32),
+        }))  # fmt: skip
+    data = root / "data/chunk-000"
+    data.mkdir(parents=True)
+    if version.startswith("v2"):
+        (root / "videos/chunk-000/front").mkdir(parents=True)
+        for episode, table in enumerate(tables):
+            pq.write_table(table, data / f"episode_{episode:06d}.parquet")
+            (root / f"videos/chunk-000/front/episode_{episode:06d}.mp4").write_bytes(b"video %d" % episode)
+        rows = [{"episode_index": k, "tasks": ["t"], "length": count} for k, count in enumerate(COUNTS)]
+        (root / "meta/episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+        stats = [{"episode_index": k, "stats": {"action": {"mean": [0.0] * 4}, "next.reward": {"mean": [7.0]}}}
+                 for k in range(3)]  # fmt: skip
+        (root / "meta/episodes_stats.jsonl").write_text("".join(json.dumps(row) + "\n" for row in stats))
+    else:
+        pq.write_table(pa.concat_tables(tables), data / "file-000.parquet")
+        folder = root / "meta/episodes/chunk-000"
+        folder.mkdir(parents=True)
+        ends = np.cumsum(COUNTS)
+        pq.write_table(pa.table({
+            "episode_index": np.arange(3), "length": COUNTS, "dataset_from_index": ends - COUNTS,
+            "dataset_to_index": ends, "stats/action/mean": [[0.0] * 4] * 3,
+            "videos/observation.images.front/from_timestamp": [0.0, 3.0, 5.5],
+        }), folder / "file-000.parquet")  # fmt: skip
+        (root / "meta/stats.json").write_text(
+            json.dumps({"action": {"mean": [0.0] * 4}, "next.reward": {"mean": [7.0]}})
+        )
+    return root
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_a_lerobot_dataset(tmp_path, version):
+    import pyarrow.parquet as pq
+
+    source = lerobot(tmp_path / "in", version)
+    data, motions, out, lines = rewrite(tmp_path, source, kept=[0, 2], units="deg")
+    assert (data.entry, data.commands, data.unit) == ("observation.state", ("action",), "deg")
+    assert lines == []
+    info = json.loads((out / "meta/info.json").read_text())
+    assert info["robot_type"] == LEARNER.name
+    assert (info["total_episodes"], info["total_frames"]) == (2, COUNTS[0] + COUNTS[2])
+    assert info["splits"] == {"train": "0:1", "test": "1:2"}
+    assert info["features"]["observation.state"]["names"] == {"motors": [f"{name}.pos" for name in (*NEW, "gripper")]}
+    assert info["features"]["action"]["shape"] == [5]
+    for entry in ("observation.state", "action"):
+        back = read_source(out, NEW, entry, None).motions
+        for name, old in (("episode 0", "episode 0"), ("episode 1", "episode 2")):
+            np.testing.assert_allclose(np.radians(back[name].qpos), motions[entry][old].qpos, atol=1e-5)
+            np.testing.assert_allclose(back[name].gripper, data.measured[old].gripper, atol=1e-4)
+    table = pq.ParquetFile(sorted(out.glob("data/*/*.parquet"))[-1]).read()
+    rewards = table["next.reward"].to_numpy()
+    assert rewards[-1] == 200 + COUNTS[2] - 1  # other columns are carried over
+    assert table["index"].to_numpy()[-1] == COUNTS[0] + COUNTS[2] - 1
+    whole = np.degrees(np.concatenate([motions["action"][name].qpos for name in ("episode 0", "episode 2")]))
+    if version == "v2.1":
+        assert (out / "videos/chunk-000/front/episode_000001.mp4").read_bytes() == b"video 2"
+        assert not (out / "videos/chunk-000/front/episode_000002.mp4").exists()
+        rows = [json.loads(line) for line in (out / "meta/episodes_stats.jsonl").read_text().splitlines()]
+        np.testing.assert_allclose(rows[0]["stats"]["action"]["mean"][:4], whole[: COUNTS[0]].mean(axis=0), atol=1e-3)
+        assert rows[1]["stats"]["next.reward"] == {"mean": [7.0]}
+        assert [json.loads(line)["length"] for line in (out / "meta/episodes.jsonl").read_text().splitlines()] == [
+            60,
+            70,
+        ]
+    else:
+        stats = json.loads((out / "meta/stats.json").read_text())
+        np.testing.assert_allclose(stats["action"]["mean"][:4], whole.mean(axis=0), atol=1e-3)
+        assert stats["next.reward"] == {"mean": [7.0]}
+        episodes = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
+        assert episodes["dataset_from_index"] == [0, COUNTS[0]]
+        assert episodes["videos/observation.images.front/from_timestamp"] == [0.0, 5.5]
+        np.testing.assert_allclose(episodes["stats/action/mean"][1][:4], whole[COUNTS[0] :].mean(axis=0), atol=1e-3)
+
+
+# --- HDF5 -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_robomimic_file(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    source = tmp_path / "low_dim.hdf5"
+    with h5py.File(source, "w") as file:
+        file.create_group("data").attrs["total"] = sum(COUNTS)
+        file["data"].attrs["env_args"] = json.dumps({"env_kwargs": {"control_freq": RATE}})
+        for episode, count in enumerate(COUNTS):
+            _, qpos = expert_motion(count)
+            demo = file.create_group(f"data/demo_{episode}")
+            demo.attrs["num_samples"] = count
+            demo["obs/robot0_joint_pos"], demo["obs/robot0_joint_pos_cos"] = qpos, np.cos(qpos)
+            demo["obs/robot0_joint_vel"] = np.gradient(qpos, 1 / RATE, axis=0)
+            demo["next_obs/robot0_joint_pos"] = np.concatenate([qpos[1:], qpos[-1:]])
+            demo["obs/robot0_gripper_qpos"], demo["rewards"] = qpos[:, :2] / 50, np.arange(count)
+            demo["obs/image"] = np.zeros((count, 2, 2, 3), np.uint8) + episode
+        file["mask/train"] = np.array([b"demo_0", b"demo_1"])
+    _, motions, out, lines = rewrite(tmp_path, source, kept=[1, 2])
+    assert any("next_obs/robot0_joint_pos: the last one" in line for line in lines)
+    back = read_source(out / "low_dim.hdf5", NEW, "obs/robot0_joint_pos", None)
+    assert list(back.motions) == ["demo_1", "demo_2"]
+    for name, motion in back.motions.items():
+        (expected,) = (found[name] for found in motions.values())
+        np.testing.assert_allclose(motion.qpos, expected.qpos, atol=1e-12)
+        np.testing.assert_allclose(motion.qvel, expected.qvel, atol=1e-12)
+        np.testing.assert_allclose(motion.gripper, expected.gripper)
+    with h5py.File(out / "low_dim.hdf5") as file:
+        demo = file["data/demo_2"]
+        np.testing.assert_allclose(demo["obs/robot0_joint_pos_cos"], np.cos(demo["obs/robot0_joint_pos"]))
+        np.testing.assert_allclose(demo["next_obs/robot0_joint_pos"][:-1], demo["obs/robot0_joint_pos"][1:])
+        assert demo["obs/image"][0, 0, 0, 0] == 2
+        assert demo["rewards"][5] == 5
+        assert list(file["mask/train"]) == [b"demo_1"]
+        assert file["data"].attrs["total"] == COUNTS[1] + COUNTS[2]
+
+
+# --- tables and npz ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_a_table(tmp_path, separator):
+    header = ["note", "time", *(f"{name} [deg]" for name in OLD), "jaw", "demonstration"]
+    lines = ["# of a robot", separator.join(header)]
+    for episode, count in enumerate(COUNTS):
+        for time, angles in zip(*expert_motion(count), strict=True):
+            lines.append(
+                separator.join(["held", f"{time:.3f}", *(f"{x:.6f}" for x in np.degrees(angles)), "0.50", str(episode)])
+            )
+    source = tmp_path / "motions.csv"
+    source.write_text("\n".join(lines) + "\n")
+    _, motions, out, _ = rewrite(tmp_path, source, kept=[0, 2])
+    written = (out / "motions.csv").read_text().splitlines()
+    assert written[0] == "# of a robot"
+    assert written[1].split(separator) == ["note", "time", *(f"{name} [deg]" for name in NEW), "jaw", "demonstration"]
+    assert written[2].split(separator)[0] == "held"
+    assert written[2].split(separator)[-2:] == ["0.50", "0"]
+    back = read_source(out / "motions.csv", NEW, "", None)
+    assert back.unit == "deg"
+    for name, motion in back.motions.items():
+        (expected,) = (found[name] for found in motions.values())
+        np.testing.assert_allclose(np.radians(motion.qpos), expected.qpos, atol=1e-7)
+    assert list(back.motions) == ["demonstration 0", "demonstration 2"]
+
+
+def test_an_npz_file(tmp_path):
+    qpos = np.concatenate([expert_motion(count)[1] for count in COUNTS])
+    base = np.arange(len(qpos))[:, None] * np.ones(7)
+    np.savez(tmp_path / "m.npz", qpos=np.c_[base, qpos, base[:, :1]], joint_names=["root", *OLD, "lift"], dt=1 / RATE,
+             jnt_type=[0, 3, 3, 3, 2], split_points=np.cumsum([0, *COUNTS]), label="kept")  # fmt: skip
+    _, motions, out, _ = rewrite(tmp_path, tmp_path / "m.npz", kept=[1])
+    back = read_source(out / "m.npz", NEW, "", None)
+    (motion,), (expected,) = back.motions.values(), (found["motion 1"] for found in motions.values())
+    np.testing.assert_allclose(motion.qpos, expected.qpos)
+    with np.load(out / "m.npz") as content:
+        assert content["joint_names"].tolist() == ["root", *NEW, "lift"]
+        assert content["jnt_type"].tolist() == [0, 3, 3, 3, 3, 2]
+        assert content["qpos"][0, 0] == COUNTS[0]
+        assert content["label"] == "kept"
+
+
+def test_an_episode_that_needs_repair_is_a_fault(tmp_path):
+    time, qpos = expert_motion(60)
+    rows = [np.c_[time, qpos, np.full(60, 0)], np.c_[time, qpos + np.where(time[:, None] > 1, 1.0, 0), np.full(60, 1)]]
+    header = ",".join(["time", *OLD, "demonstration"])
+    np.savetxt(tmp_path / "m.csv", np.concatenate(rows), delimiter=",", header=header, comments="")
+    data = read_data_set(tmp_path / "m.csv", EXPERT)
+    assert list(data.measured) == ["demonstration 0"]
+    assert "jumps" in data.faults["demonstration 1"]
