@@ -110,7 +110,7 @@ def main() -> None:
     config = env_config("any_arm")
     held_out = training_and_held_out(config)[1].select(slice(0, options.demonstrations))
     panda = arm_arrays(build_arm(ArmConfig()))
-    env = AnyArmEnv(config, lock_sampler(panda, lock_masks(MAX_JOINTS - 1, 1)), held_out)
+    env = AnyArmEnv(config, held_out, lock_sampler(panda, lock_masks(MAX_JOINTS - 1, 1)))
     expert = jax.tree.map(jnp.asarray, panda.astype(np.float32))
     run = jax.jit(lambda arms: jax.lax.map(lambda arm: run_arm(env, expert, arm), arms))
     results: dict[str, list[Row]] = {}

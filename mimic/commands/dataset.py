@@ -82,6 +82,7 @@ _Computed = tuple[Episodes, list[str]]  # what to write, and what to tell about 
 def _prepare_rollouts(config: DatasetConfig) -> Callable[[Console], _Computed]:
     """Restores the policy of a run; the returned function computes its rollouts."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
+    trained.env.check_one_learner()
     _check_time_step(config.format, trained.env.control_dt)
     trainer = make_ppo_trainer(trained, run_dir)
     steps, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)

@@ -19,7 +19,7 @@ from mimic.runs.files import write_report
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.fine_tuning import with_one_learner
-from mimic.trainers.make import make_any_arm_trainer, make_ppo_trainer, make_trainer
+from mimic.trainers.make import make_ppo_trainer, make_trainer
 from mimic.trainers.report import make_report, show_report
 from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.trainer import Trainer
@@ -128,11 +128,8 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
     )
     evaluated = dataclasses.replace(trained, env=env)
     unseen = _unseen(config, env)
-    if env.kind == "sampled_arms":
-        trainer = make_any_arm_trainer(evaluated, run_dir, unseen)
-    else:
-        shared = make_any_arm_trainer(trained, run_dir).shared_policy() if config.learner else None
-        trainer = make_ppo_trainer(evaluated, run_dir, unseen, shared)
+    shared = make_ppo_trainer(trained, run_dir).shared_policy() if config.learner else None
+    trainer = make_ppo_trainer(evaluated, run_dir, unseen, shared)
     return dataclasses.replace(evaluated, env=trainer.env_config), trainer
 
 

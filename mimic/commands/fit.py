@@ -19,7 +19,7 @@ from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_report
 from mimic.envs import EnvConfig, env_config
 from mimic.envs.imitation import ImitationEnv
-from mimic.envs.make import make_env, make_family_env
+from mimic.envs.make import make_env
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.files import DEMONSTRATIONS, REPORT
@@ -84,12 +84,12 @@ class Run:
 
         return {path.stem: Image.open(open_file(path)) for path in sorted(self.run_dir.glob("*.png"))}
 
-    def make_env(self) -> ImitationEnv | AnyArmEnv:
+    def make_env(self) -> ImitationEnv:
         """The environment of the run, with its training demonstrations; an `AnyArmEnv` for a run of many arms."""
         env, path = self.config.env, self.run_dir / DEMONSTRATIONS
         if path.is_file():
             env = dataclasses.replace(env, demonstrations=dataclasses.replace(env.demonstrations, path=str(path)))
-        return make_family_env(env) if env.kind == "sampled_arms" else make_env(env)
+        return make_env(env)
 
     def evaluate(self, *, quiet: bool = False, **options: Any) -> dict[str, Any]:
         """Evaluates the run, as `python -m mimic.evaluate` does.
@@ -154,7 +154,7 @@ def fit(
     return Run(path)
 
 
-def _env_config(env: str | EnvConfig | ImitationEnv | AnyArmEnv, overrides: Mapping[str, Any]) -> EnvConfig:
+def _env_config(env: str | EnvConfig | ImitationEnv, overrides: Mapping[str, Any]) -> EnvConfig:
     if isinstance(env, str):
         return env_config(env, **overrides)
     if overrides:

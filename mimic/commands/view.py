@@ -172,6 +172,7 @@ def _prepare_playback(config: ViewConfig) -> Callable[[], int]:
     from mimic.viewer.playback import Playback
 
     run_dir, trained = policy_run(config.run, config.checkpoint)
+    trained.env.check_one_learner()
     trainer = make_ppo_trainer(trained, run_dir)
     _, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
     playback = Playback(trained.env, trainer.evaluator)

@@ -76,24 +76,32 @@ class ImitationEnv(Env):
       ValueError: arms or demonstrations that do not fit the config.
     """
 
+    _metrics: tuple[str, ...] = "distance", "limit_excess", "torque_saturation", "runaway"  # of a step
+
     def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None):
         compat.mend_brax()  # here: brax's trainers take any environment, wrapped by any function
+        self.config = config
+        self.reward_terms = reward_terms(config.reward.terms)
+        self.observation_terms = observation_terms(config.observation.terms)
+        expert = self._set_arms()
+        self.held_out: Demonstrations | None = None
+        if demonstrations is None:
+            demonstrations, self.held_out = training_and_held_out(config, expert)
+        self._set_demonstrations(demonstrations)
+
+    def _set_arms(self) -> Arm:
+        """Sets the arms, the metric and the physics; returns the expert."""
+        config = self.config
         arms = config.build_arms()
         self.embodiments = arms.embodiments
         self.expert, self.learner = map(config.metric.compared, arms.embodiments)
         self.metric = config.metric.build(self.expert, self.learner)
-        self.reward_terms = reward_terms(config.reward.terms)
-        self.observation_terms = observation_terms(config.observation.terms)
         self.arm = arms.learner
         self.torque_scale = jnp.asarray(torque_scale(self.arm, config.action_scale, config.control_dt))
         home = np.asarray(self.learner.home)
         self._home_states = link_state_table(self.learner, home, np.zeros_like(home))
-        self.config = config
         self._set_physics(choose_physics(config.physics, self.arm.model))
-        self.held_out: Demonstrations | None = None
-        if demonstrations is None:
-            demonstrations, self.held_out = training_and_held_out(config, arms.expert)
-        self._set_demonstrations(demonstrations)
+        return arms.expert
 
     def with_demonstrations(self, demonstrations: Demonstrations) -> "ImitationEnv":
         """The same environment on other demonstrations."""
@@ -164,8 +172,7 @@ class ImitationEnv(Env):
     def begin(self, arm_state: ArmState) -> State:
         """The brax state of an episode that starts in a state of `start`."""
         zero = jnp.zeros(())
-        metrics = {"distance": zero, "limit_excess": zero, "torque_saturation": zero, "runaway": zero}
-        metrics |= {term.metric: zero for term in self.reward_terms}
+        metrics = dict.fromkeys((*self._metrics, *(term.metric for term in self.reward_terms)), zero)
         return State(arm_state, self.observe_start(arm_state), zero, zero, metrics, {})
 
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> ArmState:
@@ -197,14 +204,11 @@ class ImitationEnv(Env):
         after, torque = self._simulate(before, command)
         qpos, qvel, step = after.qpos, after.qvel, after.step
         runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # True for NaN too
-        remaining = (self.config.horizon - step).astype(jnp.float32)
         states = link_states(self.learner, qpos, qvel)
         expert_states = self.expert_at(before.demonstration, step)
         distance = jnp.where(runaway, self._worst_distance, self.states_distance(expert_states, states))
         excess = jnp.where(runaway, 1.0, self.limit_excess(qpos, qvel))
-        # A runaway is charged its penalty for all remaining steps, so that ending an episode early is never better.
-        steps = jnp.where(runaway, 1.0 + remaining, 1.0)
-        done = (runaway | (step >= self.config.horizon)).astype(jnp.float32)
+        steps, done = self._charged_steps(runaway, step)
         metrics = {
             **state.metrics,
             "distance": distance,
@@ -221,6 +225,16 @@ class ImitationEnv(Env):
         obs = self._observe_states(after, states)
         return state.replace(pipeline_state=after, obs=obs, reward=reward, done=done, metrics=metrics)
 
+    def _charged_steps(
+        self, runaway: Bool[Array, ""], step: Int[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """The number of steps that the reward of a step counts for, and 1 where the episode is done.
+
+        A runaway is charged its penalty for all remaining steps, so that ending an episode early is never better.
+        """
+        steps = jnp.where(runaway, 1.0 + (self.config.horizon - step), 1.0)
+        return steps, (runaway | (step >= self.config.horizon)).astype(jnp.float32)
+
     def _simulate(
         self, before: ArmState, command: Float[Array, " numbers"]
     ) -> tuple[ArmState, Float[Array, " joints"]]:
@@ -236,10 +250,12 @@ class ImitationEnv(Env):
         qpos, qvel = self._advance(before.qpos, before.qvel, torque, load)
         return dataclasses.replace(before, qpos=qpos, qvel=qvel, step=step), torque
 
-    def commanded_torque(self, state: ArmState, action: Float[Array, " numbers"]) -> Float[Array, " joints"]:
-        """The torque that was commanded in the control step before a state [N m], without noise."""
-        del state
-        return action * self.torque_scale
+    def commanded_torque(
+        self, before: ArmState, after: ArmState, action: Float[Array, " numbers"]
+    ) -> Float[Array, " joints"]:
+        """The torque that an action commands in the control step from one state to the next [N m], without noise."""
+        del after
+        return self.command(before, action)
 
     def command(self, before: ArmState, action: Float[Array, " numbers"]) -> Float[Array, " joints"]:
         """What an action in [-1, 1] commands in a state: torques [N m]."""
@@ -250,12 +266,7 @@ class ImitationEnv(Env):
         """Starts a new episode, on a random demonstration, for each arm of a batch whose episode is done."""
         arms = arm_state(states)
         new = jax.vmap(self.reset)(arms.key)
-        done = states.done.astype(bool)
-
-        def where_done(new: Array, old: Array) -> Array:
-            return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
-
-        arms, obs = jax.tree.map(where_done, (new.pipeline_state, new.obs), (arms, states.obs))
+        arms, obs = where_done(states.done, (new.pipeline_state, new.obs), (arms, states.obs))
         return states.replace(pipeline_state=arms, obs=obs)
 
     def distance(
@@ -314,7 +325,9 @@ class ImitationEnv(Env):
 
     def observe_start(self, state: ArmState) -> Float[Array, " observation"]:
         """The observation of a state of `start`; at rest in the home pose it costs less than `observe`."""
-        return self._observe_states(state, self._home_states) if self.config.start == "home" else self.observe(state)
+        if self._has_own_observation or self.config.start != "home":
+            return self.observe(state)
+        return self._link_observation(state, self._home_states)
 
     @property
     def _has_own_observation(self) -> bool:
@@ -349,6 +362,15 @@ class ImitationEnv(Env):
     def backend(self) -> str:
         """Name of the physics backend, for brax."""
         return self.physics.name
+
+
+def where_done(done: Float[Array, " batch"], new: Any, old: Any) -> Any:
+    """The new values of the samples of a batch whose episode is done, and the old ones of the others."""
+
+    def choose(new: Array, old: Array) -> Array:
+        return jnp.where(done.astype(bool).reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
+
+    return jax.tree.map(choose, new, old)
 
 
 def _opposite_links() -> tuple[LinkStates, LinkStates]:

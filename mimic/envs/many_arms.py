@@ -8,28 +8,29 @@ already a controller of any arm, and a policy learns what it lacks.
 
 import copy
 import dataclasses
+import functools
 from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env, State
+from brax.envs.base import State
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from mimic.arms.arm import build_arm
+from mimic.arms.arm import Arm, build_arm
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.arms.sampler import Sampler
-from mimic.base import compat
 from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig
-from mimic.envs.family import arms_config
+from mimic.envs.family import arm_sampler, arms_config, check_family
+from mimic.envs.imitation import ImitationEnv, where_done
 from mimic.envs.many_arms_control import Plan, make_plan, max_speed, planned_torque, torque_scale
 from mimic.envs.many_arms_observation import observation_size, observe
 from mimic.metric.config import check_metric
 from mimic.metric.correspondence import arc_length_correspondence
 from mimic.metric.distance import Metric
-from mimic.metric.kinematics import LinkStates, link_states
+from mimic.metric.kinematics import link_states
 from mimic.motions.demonstrations import Demonstrations
 from mimic.physics.composite_kernel import make_advance
 from mimic.physics.step import Load, PhysicsChoice
@@ -64,8 +65,8 @@ class AnyArmState(ArmState):
     baseline: "AnyArmState | None" = None
 
 
-class AnyArmEnv(Env):
-    """Arms of a sampler that imitate the demonstrations of one expert; a brax environment.
+class AnyArmEnv(ImitationEnv):
+    """An `ImitationEnv` whose learner is drawn by a sampler for each episode, and carried by the state.
 
     Reward, as `config.arms.reward` says. "distance": minus the embodiment distance to the expert after the step,
     divided by the mean distance of holding the home pose. "relative": how much nearer the arm is than with zero actions
@@ -74,56 +75,61 @@ class AnyArmEnv(Env):
     `planned_torque`. Observation: see `mimic.envs.many_arms_observation.observe`.
 
     Args:
-      config: expert, metric, demonstrations and time steps; its learner is not used.
-      sampler: draws the learner of an episode.
-      demonstrations: motions to imitate.
+      config: see `EnvConfig`; of the kind "sampled_arms".
+      demonstrations: see `ImitationEnv`.
+      sampler: draws the learner of an episode; that of the config where None.
 
     Attributes:
-      config: the config.
-      physics: which physics simulates the arms, and why.
       sampler: draws the learner of an episode.
-      expert: the arm that is imitated.
-      demonstrations: motions to imitate.
-      expert_states: link states of the demonstrations, [demonstrations, time, expert links, 3] each.
+      expert_arrays: the expert, as the learners are.
 
     Raises:
-      ValueError: a metric or expert that arrays do not cover, or demonstrations that do not fit.
+      ValueError: settings that such an environment does not have, a metric or expert that arrays do not cover, or
+        demonstrations that do not fit.
     """
 
-    def __init__(self, config: EnvConfig, sampler: Sampler, demonstrations: Demonstrations):
-        compat.mend_brax()
-        self.config, self.sampler = config, sampler
+    _metrics = "distance", "runaway"
+
+    def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None, sampler: Sampler | None = None):
+        check_family(config)
+        self.sampler = sampler or arm_sampler(config)
+        super().__init__(config, demonstrations)
+
+    def _set_arms(self) -> Arm:
+        config = self.config
         self._weights = check_metric(config.metric)
         expert = build_arm(config.expert, config.limits, config.metric.links)
-        demonstrations.check_fits(expert.embodiment, config.control_dt, config.horizon)
         self.expert = expert.embodiment
-        self._expert_arrays = jax.tree.map(jnp.asarray, arm_arrays(expert).astype(np.float32))
-        self.demonstrations = demonstrations
-        motions = (demonstrations.qpos, demonstrations.qvel)
-        padding = [(0, 0), (0, 0), (0, MAX_JOINTS - expert.embodiment.num_joints)]
-        padded = (np.pad(x, padding).astype(np.float32) for x in motions)
-        table = jax.jit(jax.vmap(jax.vmap(lambda *motion: link_states(self._expert_arrays, *motion))))(*padded)
-        self.expert_states: LinkStates = table
+        self.expert_arrays = jax.tree.map(jnp.asarray, arm_arrays(expert).astype(np.float32))
         self.physics = PhysicsChoice("fused", "the arm is data of the compiled function")
+        self.config = dataclasses.replace(config, physics=self.physics.name)
         self._advance = make_advance(config.control_dt / config.substeps, config.substeps)
+        return expert
 
-    def with_expert_states(self, states: LinkStates) -> "AnyArmEnv":
-        """The same environment with another array for `expert_states`, see `ImitationEnv.with_expert_states`."""
+    def _set_demonstrations(self, demonstrations: Demonstrations) -> None:
+        demonstrations.check_fits(self.expert, self.config.control_dt, self.config.horizon)
+        self.demonstrations = demonstrations
+        padding = [(0, 0), (0, 0), (0, MAX_JOINTS - self.expert.num_joints)]
+        motions = (np.pad(x, padding).astype(np.float32) for x in (demonstrations.qpos, demonstrations.qvel))
+        # By the kinematics of the learners, so that an arm that equals the expert can match it exactly.
+        states = functools.partial(link_states, self.expert_arrays)
+        self.expert_states = jax.jit(jax.vmap(jax.vmap(states)))(*motions)
+
+    def by_distance(self) -> "AnyArmEnv":
+        """The same environment with the reward "distance", whose state has no baseline to simulate."""
         env = copy.copy(self)
-        env.expert_states = states
+        arms = dataclasses.replace(arms_config(self.config), reward="distance")
+        env.config = dataclasses.replace(self.config, arms=arms)
         return env
 
-    def reset(self, rng: Array) -> State:
-        """Starts an episode: a random demonstration at its first step, a new arm in its home pose."""
-        return self.begin(self.start(rng))
-
-    def start(self, key: Array) -> AnyArmState:
-        """The first state of an episode of a new arm, on a random demonstration."""
+    def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> AnyArmState:
+        """The first state of an episode of a new arm; the demonstration is random where None."""
         key_demonstration, key_arm, key_next = jax.random.split(key, 3)
-        demonstration = jax.random.randint(key_demonstration, (), 0, self.demonstrations.count)
+        if demonstration is None:
+            demonstration = jax.random.randint(key_demonstration, (), 0, self.demonstrations.count)
         return self.start_of(self.sampler(key_arm), demonstration, key_next)
 
-    def start_of(self, arm: ArmArrays, demonstration: Array, key: Array) -> AnyArmState:
+    def start_of(self, arm: ArmArrays, demonstration: Int[Array, ""] | int, key: Array) -> AnyArmState:
         """The first state of an episode of a given arm on a demonstration."""
         metric, zeros = self.metric_of(arm), jnp.zeros(MAX_JOINTS)
         samples = jnp.linspace(1, self.config.horizon, _HOLD_SAMPLES).astype(jnp.int32)
@@ -157,30 +163,22 @@ class AnyArmEnv(Env):
 
     def _planned(self, state: AnyArmState) -> AnyArmState:
         expert = self.expert_at(state.demonstration, state.step + 1)
-        matrix, dt = arc_length_correspondence(self._expert_arrays, state.arm), self.config.control_dt
+        matrix, dt = arc_length_correspondence(self.expert_arrays, state.arm), self.config.control_dt
         problem = Problem(state.arm, self._weights, matrix, expert, dt)
         goals = next_goals(problem, state.followed, state.qpos, random_numbers(state.key, state.step))
         speed = max_speed(state.arm, self.config.limits)
         plan = make_plan(state.arm, state.qpos, state.qvel, goals.goal, speed, dt)
         return dataclasses.replace(state, goals=goals, plan=plan)
 
-    def at_step(self, state: AnyArmState, step: Array) -> AnyArmState:
+    def at_step(self, state: ArmState, step: Int[Array, ""]) -> AnyArmState:
         """A state of `start` at another step of its demonstration."""
+        state = cast(AnyArmState, state)
         baseline = None if state.baseline is None else dataclasses.replace(state.baseline, step=step)
         return self.with_plan(dataclasses.replace(state, step=step, baseline=baseline))
 
     def metric_of(self, arm: ArmArrays) -> Metric:
         """The metric between the expert and an arm."""
-        return Metric(arc_length_correspondence(self._expert_arrays, arm), self._weights)
-
-    def begin(self, state: AnyArmState) -> State:
-        """The brax state of an episode that starts in a state."""
-        zero = jnp.zeros(())
-        return State(state, self.observe(state), zero, zero, {"distance": zero, "runaway": zero}, {})
-
-    def observe_start(self, state: AnyArmState) -> Float[Array, " observation"]:
-        """The observation of a state."""
-        return self.observe(state)
+        return Metric(arc_length_correspondence(self.expert_arrays, arm), self._weights)
 
     def step(self, state: State, action: Float[Array, " actions"]) -> State:
         """Advances an episode by one control step of constant torque.
@@ -198,9 +196,7 @@ class AnyArmEnv(Env):
             baseline, own, _ = self._moved(before.baseline, jnp.zeros(self.action_size))
             after = dataclasses.replace(after, baseline=baseline)
             reward = relative_reward(distance, own, self._nearest(before), after.hold)
-        # A runaway is charged for all remaining steps, so that ending an episode early is never better.
-        steps = jnp.where(runaway, 1.0 + (self.config.horizon - after.step), 1.0)
-        done = (runaway | (after.step >= self.config.horizon)).astype(jnp.float32)
+        steps, done = self._charged_steps(runaway, after.step)
         metrics = {**state.metrics, "distance": distance, "runaway": runaway.astype(jnp.float32)}
         after = self.with_plan(after)
         observation = self.observe(after)
@@ -210,7 +206,7 @@ class AnyArmEnv(Env):
         self, before: AnyArmState, action: Float[Array, " actions"]
     ) -> tuple[AnyArmState, Float[Array, ""], Bool[Array, ""]]:
         """The state after a step, without its plan; the distance there; and whether the arm runs away."""
-        torque = self.torque(before, action)
+        torque = self.command(before, action)
         qpos, qvel = self._advance(before.arm, before.qpos, before.qvel, torque, Load())
         followed = chosen_goal(before.goals)
         after = dataclasses.replace(before, qpos=qpos, qvel=qvel, step=before.step + 1, followed=followed)
@@ -227,31 +223,22 @@ class AnyArmEnv(Env):
         own, baseline = (metric(expert, link_states(before.arm, goal.qpos, goal.qvel)) for goal in goals)
         return jnp.fmin(own, baseline)  # a baseline that ran away may be NaN, and must not end the training
 
-    def torque(self, state: AnyArmState, action: Float[Array, " actions"]) -> Float[Array, " joints"]:
+    def command(self, before: ArmState, action: Float[Array, " actions"]) -> Float[Array, " joints"]:
         """The torque of an action [N m]."""
+        state = cast(AnyArmState, before)
         return planned_torque(state.arm, state.plan, action, state.max_torque, self.config.control_dt)
 
     def restart_done(self, states: State) -> State:
         """Starts a new episode of a new arm for each arm of a batch whose episode is done."""
         arms = any_arm_state(states)
-        new = jax.vmap(self.start)(arms.key)
-        done = states.done.astype(bool)
-
-        def where_done(new: Array, old: Array) -> Array:
-            return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
-
-        arms = jax.tree.map(where_done, new, arms)
+        arms = where_done(states.done, jax.vmap(self.start)(arms.key), arms)
         # Once for all: XLA removes the plans and observations of `step` and `start`, which nothing uses.
         arms = jax.vmap(self.with_plan)(arms)
         return states.replace(pipeline_state=arms, obs=jax.vmap(self.observe)(arms))
 
-    def expert_at(self, demonstration: Array, step: Array) -> LinkStates:
-        """The expert's link states at a step of a demonstration."""
-        last = self.demonstrations.horizon
-        return jax.tree.map(lambda table: table[demonstration, jnp.minimum(step, last)], self.expert_states)
-
-    def observe(self, state: AnyArmState) -> Float[Array, " observation"]:
+    def observe(self, state: ArmState) -> Float[Array, " observation"]:
         """The observation, see `mimic.envs.many_arms_observation.observe`."""
+        state = cast(AnyArmState, state)
         expert = self.expert_at(state.demonstration, state.step + 1)
         expert = jax.tree.map(lambda x: x[: self.expert.num_links], expert)
         inputs = state.qpos, state.qvel, state.goals, state.max_torque, state.plan
@@ -266,11 +253,6 @@ class AnyArmEnv(Env):
     def action_size(self) -> int:
         """Length of an action: one number for each joint slot."""
         return MAX_JOINTS
-
-    @property
-    def backend(self) -> str:
-        """Name of the physics backend, for brax."""
-        return self.physics.name
 
 
 def relative_reward(

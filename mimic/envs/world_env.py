@@ -2,7 +2,7 @@
 
 import copy
 import dataclasses
-from typing import Any, cast
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -161,10 +161,12 @@ class HardwareEnv(ImitationEnv):
         qpos = state.qpos + draw.bias + world.position_noise * noise[0]
         return jnp.concatenate([qpos, state.qvel + world.velocity_noise * noise[1], reference.qpos, reference.qvel])
 
-    def commanded_torque(self, state: ArmState, action: Float[Array, " numbers"]) -> Float[Array, " joints"]:
+    def commanded_torque(
+        self, before: ArmState, after: ArmState, action: Float[Array, " numbers"]
+    ) -> Float[Array, " joints"]:
         """The torque of the last period [N m], in addition to gravity compensation."""
-        del action
-        return cast(Any, state).torque
+        del before, action
+        return cast(HardwareState, after).torque
 
     def expert_at(self, demonstration: Array, step: Array) -> LinkStates:
         """See `ImitationEnv`; after the horizon the expert stays where it is, as in an exported controller."""
@@ -181,10 +183,6 @@ class HardwareEnv(ImitationEnv):
         measured = state.measured[state.draw.observation_delay]
         expert = [self.expert_at(state.demonstration, state.step + k) for k in range(self.config.preview + 1)]
         return control_observation(self, measured, state.sent.ravel(), expert_vector(expert))
-
-    def observe_start(self, state: ArmState) -> Float[Array, " observation"]:
-        """The observation of a state of `start`."""
-        return self.observe(state)
 
 
 def plant_of(config: EnvConfig, arm: Arm) -> Plant:

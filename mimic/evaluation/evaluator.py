@@ -3,9 +3,9 @@
 import copy
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +14,14 @@ from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float
 
-from mimic.arms.pose_limits import pose_limits
-from mimic.base.compilation import Background, on_host
+from mimic.arms.arrays import ArmArrays, stack_arms
+from mimic.base.compilation import Background
+from mimic.envs.family import SEEN, UNSEEN
 from mimic.envs.imitation import ImitationEnv
+from mimic.envs.many_arms import AnyArmEnv
 from mimic.evaluation.labels import ALL_KINDS, SPLITS
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
+from mimic.evaluation.references import CONTROLLER, Motions, references_of_arms, references_of_one_arm
 from mimic.evaluation.rollout_metrics import (
     WORST,
     Table,
@@ -27,24 +30,20 @@ from mimic.evaluation.rollout_metrics import (
     means_by_split,
     measure,
     measure_similarity,
+    speed_violations,
 )
 from mimic.metric.kinematics import link_state_table
 from mimic.metric.similarity import CentreLine, centre_line_table
 from mimic.motions.demonstrations import Demonstrations, concatenate, effective_rank
-from mimic.retargeting.kinematic_bound import closest_motion
-from mimic.retargeting.pose import shared_joints
-from mimic.retargeting.pose_baselines import baseline_poses
 from mimic.runs.files import write_csv
 
 Controller = Callable[[State], Array]  # (state of the environment) -> action
-Motions = Float[np.ndarray, "demonstrations time joints"]
-_CHUNK = 256  # demonstrations whose bound is searched at a time
 EVALUATED_TRAINING = 80  # demonstrations for training that are evaluated, or as many as those held out
 
 
 @struct.dataclass
 class Rollouts:
-    """Rollouts of a controller, one for each demonstration.
+    """Rollouts of a controller, one for each demonstration; of many arms, one for each arm and demonstration.
 
     Attributes:
       qpos: [demonstrations, T, joints] learner's joint angles after each step [rad].
@@ -66,22 +65,61 @@ class Rollouts:
     reward_terms: dict[str, Float[Array, "demonstrations time"]] = struct.field(default_factory=dict)
 
 
+class Group(NamedTuple):
+    """The rows of an arm in a split."""
+
+    split: str
+    arm: str
+    rows: slice
+
+
 class Evaluator:
     """Evaluates controllers on the training and the held-out demonstrations of an environment.
+
+    Where the environment draws its learner, it evaluates the arms of a report on the held-out demonstrations. The
+    splits are then those of the arms: "train" are those seen in training. A row of a table is a demonstration; of many
+    arms, those of the first arm come first, then those of the second, and so on.
 
     Args:
       env: the training environment.
       held_out: demonstrations for evaluation only.
+      arms: the arms of a report by split and name, see `report_arms`; none where the environment has one learner.
+      controller: the rollouts of the zero action of many arms, with which they are compared.
 
     Attributes:
       env: the training environment on the evaluated demonstrations, those for training first.
+      groups: the rows of each arm and split.
+
+    Raises:
+      ValueError: no arms, or two of one name.
     """
 
-    def __init__(self, env: ImitationEnv, held_out: Demonstrations):
-        training = env.demonstrations.select(slice(0, max(EVALUATED_TRAINING, held_out.count)))
-        self._num_train = training.count
-        self.env = env.with_demonstrations(concatenate(training, held_out))
-        self._references = Background(lambda: _references(self.env))
+    def __init__(
+        self,
+        env: ImitationEnv,
+        held_out: Demonstrations,
+        arms: Mapping[str, Mapping[str, ArmArrays]] | None = None,
+        controller: "Callable[[], Rollouts] | None" = None,
+    ):
+        self._arms: ArmArrays | None = None  # [arms, ...] each
+        if arms is None:
+            training = env.demonstrations.select(slice(0, max(EVALUATED_TRAINING, held_out.count)))
+            self.env = env.with_demonstrations(concatenate(training, held_out))
+            ends = 0, training.count, training.count + held_out.count
+            self.groups = [Group(split, env.learner.name, slice(*ends[i : i + 2])) for i, split in enumerate(SPLITS)]
+            self._references = Background(lambda: references_of_one_arm(self.env))
+            return
+        assert isinstance(env, AnyArmEnv) and controller is not None
+        of_many = self.env = env.by_distance().with_demonstrations(held_out)
+        names = [(split, name) for split, key in zip(SPLITS, (SEEN, UNSEEN), strict=True) for name in arms[key]]
+        if len({name for _, name in names}) < max(len(names), 1):
+            shown = ", ".join(name for _, name in names)
+            raise ValueError(f"arms: expected arms of different names in the report, got {shown}")
+        count = held_out.count
+        self.groups = [Group(*names[i], slice(i * count, (i + 1) * count)) for i in range(len(names))]
+        stacked = stack_arms([arm for key in (SEEN, UNSEEN) for arm in arms[key].values()]).astype(np.float32)
+        self._arms = stacked
+        self._references = Background(lambda: references_of_arms(of_many, stacked, controller()))
 
     def on_mjx(self) -> "Evaluator":
         """An evaluator of rollouts on MJX, with the same bound and the same baselines."""
@@ -117,16 +155,27 @@ class Evaluator:
         demonstrations = self.env.demonstrations
         return Evaluator(self.env.with_demonstrations(demonstrations.select([])), demonstrations.select([index]))
 
-    def rollout(self, controller: Controller | ControllerWithMemory) -> Rollouts:
-        """Runs a controller on every demonstration. Call it under `jax.jit`."""
-        env = self.env
+    def rollout(
+        self, controller: Controller | ControllerWithMemory, demonstrations: Demonstrations | None = None
+    ) -> Rollouts:
+        """Runs a controller on every demonstration. Call it under `jax.jit`.
+
+        Args:
+          controller: the controller.
+          demonstrations: others than those of the evaluator.
+        """
+        env = self.env if demonstrations is None else self.env.with_demonstrations(demonstrations)
         if not isinstance(controller, ControllerWithMemory):
             function = controller
             controller = ControllerWithMemory(lambda state: (), lambda state, memory: (function(state), memory))
 
-        def begin(demonstration: Array) -> tuple[State, Any]:
-            key = jax.random.fold_in(jax.random.PRNGKey(0), demonstration)
-            state = env.begin(env.start(key, demonstration))
+        def begin(demonstration: Array, arm: ArmArrays | None) -> tuple[State, Any]:
+            key = jax.random.PRNGKey(0)
+            if arm is None:
+                start = env.start(jax.random.fold_in(key, demonstration), demonstration)
+            else:
+                start = cast(AnyArmEnv, env).start_of(arm, demonstration, key)
+            state = env.begin(start)
             return state, controller.start(state)
 
         def step(carry: tuple[State, Any]) -> tuple[tuple[State, Any], Rollouts]:
@@ -134,32 +183,46 @@ class Evaluator:
             action = jnp.clip(action, -1.0, 1.0)
             state = env.step(carry[0], action)
             after: Any = state.pipeline_state
-            torque, command = env.commanded_torque(after, action), env.command(carry[0].pipeline_state, action)
+            before: Any = carry[0].pipeline_state
+            torque, command = env.commanded_torque(before, after, action), env.command(before, action)
             terms = {term.name: state.metrics[term.metric] for term in env.reward_terms}
             distance = state.metrics["distance"]
             return (state, memory), Rollouts(after.qpos, after.qvel, torque, distance, command, reward_terms=terms)
 
         # `vmap` is inside the loop: around the loop, JAX would trace a step twice, without and with the batch.
-        start = jax.vmap(begin)(jnp.arange(env.demonstrations.count))
+        count = env.demonstrations.count
+        arms = self._arms_of_rows(count)
+        start = jax.vmap(begin)(jnp.tile(jnp.arange(count), 1 if arms is None else len(self.groups)), arms)
         _, over_time = jax.lax.scan(lambda carry, _: jax.vmap(step)(carry), start, None, length=env.config.horizon)
         rollouts = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), over_time)
         first: Any = start[0].pipeline_state
         return dataclasses.replace(rollouts, start=first.qpos)
 
+    def _arms_of_rows(self, count: int) -> ArmArrays | None:
+        """The arm of each row, where each arm has `count` demonstrations; None for one learner."""
+        if self._arms is None:
+            return None
+        return jax.tree.map(lambda x: np.repeat(x, count, axis=0), self._arms)
+
     @property
     def parts(self) -> dict[str, slice]:
-        """The demonstrations of each split, as slices of all demonstrations."""
-        return {"train": slice(0, self._num_train), "held_out": slice(self._num_train, None)}
+        """The rows of each split that has an arm, as slices of all rows."""
+        rows = {group.split: [g.rows for g in self.groups if g.split == group.split] for group in self.groups}
+        return {split: slice(slices[0].start, slices[-1].stop) for split, slices in rows.items()}
 
     @functools.cached_property
     def _expert_line(self) -> CentreLine:
-        """Centre lines of the demonstrations after each step."""
-        steps, expert = self.env.config.horizon, self.env.embodiments[0]
-        return centre_line_table(expert, self.env.demonstrations.qpos[:, 1 : steps + 1].astype(np.float32))
+        """Centre lines of the expert after each step, for each row."""
+        qpos = self.env.demonstrations.qpos[:, 1 : self.env.config.horizon + 1].astype(np.float32)
+        line = centre_line_table(self.env.embodiments[0], qpos)
+        if self._arms is None:
+            return line
+        return jax.tree.map(lambda x: np.tile(x, (len(self.groups), *[1] * (x.ndim - 1))), line)
 
     def similarity(self, qpos: Motions) -> Table:
-        """Similarity of a learner's motions, one row for each demonstration, see `measure_similarity`."""
-        return measure_similarity(self._expert_line, self.env.embodiments[1], np.asarray(qpos, np.float32))
+        """Similarity of a learner's motions, one row for each, see `measure_similarity`."""
+        learner = self._arms_of_rows(self.env.demonstrations.count) or self.env.embodiments[1]
+        return measure_similarity(self._expert_line, learner, np.asarray(qpos, np.float32))
 
     @functools.cached_property
     def _baseline_similarity(self) -> dict[str, Table]:
@@ -169,50 +232,79 @@ class Evaluator:
         """Means by split of each measure of similarity, for a controller and for the baselines.
 
         The baselines are `nearest_poses`, the poses of the kinematic bound, and those of
-        `mimic.retargeting.pose_baselines.BASELINES`.
+        `mimic.retargeting.pose_baselines.BASELINES`; of many arms, the zero action and holding the home pose.
         """
-        tables = {controller: self.similarity(np.asarray(rollouts.qpos)), **self._baseline_similarity}
+        baselines = dict(self._baseline_similarity)
+        if controller != "policy":
+            baselines.pop(CONTROLLER, None)  # it is the one that was evaluated
+        tables = {controller: self.similarity(np.asarray(rollouts.qpos)), **baselines}
         return means_by_split(tables, self.parts)
 
     def table(self, rollouts: Rollouts) -> Table:
         """One row for each demonstration: gap, mean distance, bound, distance of the start pose, and `measure`'s.
 
-        `reward.NAME` is the mean of a reward term, unweighted.
+        `reward.NAME` is the mean of a reward term, unweighted. Of many arms there are the distance of the zero action
+        and the fraction of steps above a velocity limit instead of `measure`'s columns. The bound is the result of a
+        search; at steps where a rollout of one of many arms is below it, it is lowered to the rollout.
         """
         qpos, qvel, torque = (np.asarray(x) for x in (rollouts.qpos, rollouts.qvel, rollouts.torque))
-        states = link_state_table(self.env.learner, qpos, qvel)
-        distances = np.asarray(rollouts.distance), self.lower_bound, self.hold_distance
-        distance, bound, hold = (x.mean(axis=1, dtype=float) for x in distances)
+        distances, bounds, controller = np.asarray(rollouts.distance), self.lower_bound, self._references().controller
+        if self._arms is None:
+            measured = measure(self.env, link_state_table(self.env.learner, qpos, qvel), qpos, qvel, torque)
+        else:
+            assert controller is not None
+            bounds, controller_distance = np.minimum(bounds, distances), controller.mean(axis=1, dtype=float)
+            arms = cast(ArmArrays, self._arms_of_rows(self.env.demonstrations.count))
+            measured = {"controller_distance": controller_distance, "speed_violations": speed_violations(arms, qvel)}
+        distance, bound, hold = (x.mean(axis=1, dtype=float) for x in (distances, bounds, self.hold_distance))
         return {
             "optimality_gap": gaps(distance, bound, hold),
             "mean_distance": distance,
             "lower_bound": bound,
             "hold_distance": hold,
-            **measure(self.env, states, qpos, qvel, torque),
+            **measured,
             **{f"reward.{name}": np.asarray(x).mean(axis=1, dtype=float) for name, x in rollouts.reward_terms.items()},
         }
 
+    def by_arm(self, table: Table) -> Table:
+        """Totals of the columns over the rows of each of `groups`: sums of violations of one arm, otherwise means.
+
+        The gaps are those of the mean distances. `span` is the fraction of the distance of holding that a best motion
+        saves.
+        """
+
+        def of_groups(key: str) -> np.ndarray:
+            total = np.sum if self._arms is None and key.endswith("violations") else np.mean
+            return np.array([total(table[key][group.rows]) for group in self.groups])
+
+        totals = {key: of_groups(key) for key in table if key != "optimality_gap"}
+        bound, hold = totals["lower_bound"], totals["hold_distance"]
+        columns = {"gap": gaps(totals["mean_distance"], bound, hold)}
+        if self._arms is not None:
+            columns["controller_gap"] = gaps(totals.pop("controller_distance"), bound, hold)
+        return {**columns, **totals, "span": 1 - bound / np.maximum(hold, 1e-12)}
+
     def summary(self, rollouts: Rollouts) -> dict[str, Any]:
-        """The metrics of a controller, for the training and the held-out demonstrations."""
-        table, parts = self.table(rollouts), self.parts
+        """The metrics of a controller by split; of many arms means over them, their median and their largest gap."""
+        table = self.table(rollouts)
+        by_arm, splits = self.by_arm(table), np.array([group.split for group in self.groups])
 
-        def by_split(values: np.ndarray, total: Callable[..., Any] = np.mean) -> dict[str, float]:
-            return {split: total(values[part]).item() for split, part in parts.items()}
+        def by_split(key: str, total: Callable[[np.ndarray], Any] = np.mean) -> dict[str, float]:
+            values = {split: by_arm[key][splits == split] for split in self.parts}
+            finite = {split: of_split[~np.isnan(of_split)] for split, of_split in values.items()}
+            return {split: total(of_split).item() if of_split.size else np.nan for split, of_split in finite.items()}
 
-        means = {key: by_split(table[key]) for key in ("mean_distance", "lower_bound", "hold_distance")}
-        return {
-            "optimality_gap": {split: float(gaps(*(mean[split] for mean in means.values()))) for split in SPLITS},
-            **means,
-            "by_kind": self._by_kind(table),
-            "effective_rank": {
-                split: effective_rank(self.env.demonstrations.select(part)) for split, part in parts.items()
-            },
-            **{
-                key: by_split(values, np.sum if key.endswith("violations") else np.mean)
-                for key, values in table.items()
-                if key not in means and key != "optimality_gap"
-            },
-        }
+        if self._arms is None:
+            own: dict[str, Any] = {"by_kind": self._by_kind(table), "effective_rank": self._effective_rank()}
+        else:
+            own = {"median_gap": by_split("gap", np.median), "largest_gap": by_split("gap", np.max)}
+            own["controller_gap"] = by_split("controller_gap")
+        columns = [key for key in by_arm if key not in ("gap", "controller_gap", "span")]
+        return {"optimality_gap": by_split("gap"), **own, **{key: by_split(key) for key in columns}}
+
+    def _effective_rank(self) -> dict[str, float]:
+        demonstrations = self.env.demonstrations
+        return {split: effective_rank(demonstrations.select(part)) for split, part in self.parts.items()}
 
     def _by_kind(self, table: Table) -> dict[str, dict[str, dict[str, float]]]:
         """The gap of each kind of demonstrations and of all, with its interval, as {kind: {split: {name: number}}}."""
@@ -248,6 +340,21 @@ class Evaluator:
             rows += [(split, round(dt * (i + 1), 9), *values) for i, values in enumerate(zip(*columns, strict=True))]
         write_csv(out, ["split", "time", "mean", "low", "high", "bound", "hold"], rows)
 
+    def details(self, rollouts: Rollouts) -> dict[str, dict[str, Any]]:
+        """The row of each of many arms in `by_arm`, its number of joints, and whether training has seen it."""
+        by_arm, details = self.by_arm(self.table(rollouts)), {}
+        for i, (split, name, _) in enumerate(self.groups):
+            joints = int(np.sum(cast(ArmArrays, self._arms).is_free[i]))
+            values = {key: column[i].item() for key, column in by_arm.items()}
+            details[name] = {"seen": split == "train", "joints": joints, **values}
+        return details
+
+    def save_arms(self, rollouts: Rollouts, out: Path) -> None:
+        """Writes `details` as CSV."""
+        rows = [{"arms": "seen" if arm.pop("seen") else "unseen", "arm": name, **arm}
+                for name, arm in self.details(rollouts).items()]  # fmt: skip
+        write_csv(out, list(rows[0]), [tuple(row.values()) for row in rows])
+
     def save_table(self, rollouts: Rollouts, out: Path) -> None:
         """Writes the table as CSV, with the split and the number of each demonstration."""
         table = {**self.table(rollouts), **self.similarity(np.asarray(rollouts.qpos))}
@@ -255,55 +362,3 @@ class Evaluator:
         kinds = self.env.demonstrations.kinds
         rows = [(*number, *row) for number, *row in zip(numbers, kinds, *table.values(), strict=True)]
         write_csv(out, ["split", "demonstration", "kind", *table], rows)
-
-
-class References(NamedTuple):
-    """The references of the metrics.
-
-    Attributes:
-      bound: [demonstrations, time] the kinematic bound.
-      hold: [demonstrations, time] distance of holding the start pose.
-      motions: the learner's angles [demonstrations, time, joints] [rad] by baseline; see
-        `Evaluator.similarity_summary`.
-    """
-
-    bound: Float[np.ndarray, "demonstrations time"]
-    hold: Float[np.ndarray, "demonstrations time"]
-    motions: dict[str, Motions]
-
-
-def _references(env: ImitationEnv) -> References:
-    steps = env.config.horizon
-    qpos, qvel = (x[:, 1 : steps + 1] for x in (env.demonstrations.qpos, env.demonstrations.qvel))
-    copied_qpos, copied_qvel = (shared_joints(env.expert, env.learner, x) for x in (qpos, qvel))
-    copied_qpos = np.clip(copied_qpos, *pose_limits(env.learner, float))
-    expert = jax.tree.map(lambda x: np.asarray(x)[:, 1 : steps + 1], env.expert_states)
-    distance = jax.jit(jax.vmap(jax.vmap(env.states_distance)))
-    held_qpos = np.broadcast_to(env.start_poses[:, None], copied_qpos.shape)
-    copied, hold = (
-        np.asarray(distance(expert, link_state_table(env.learner, *motion)))
-        for motion in ((copied_qpos, copied_qvel), (held_qpos, np.zeros_like(copied_qvel)))
-    )
-    # If copying the expert's joints gives distance 0 everywhere, the bound needs no optimisation.
-    bound, nearest = _lower_bound(env, qpos, qvel) if copied.any() else (copied, copied_qpos)
-    motions = {"nearest_poses": nearest, **baseline_poses(env.expert, env.learner, qpos)}
-    return References(bound, hold, motions)
-
-
-def _lower_bound(env: ImitationEnv, qpos: Motions, qvel: Motions) -> tuple[np.ndarray, Motions]:
-    """The kinematic bound [demonstrations, time], and its poses."""
-
-    def closest(qpos: Array, qvel: Array) -> tuple[Array, Array]:
-        solution = closest_motion(env.expert, env.learner, qpos, qvel, **env.metric.arguments)
-        return solution.distance, solution.qpos
-
-    # Of many demonstrations in chunks of one size, the last one filled up: all at once, they need too much memory.
-    count = len(qpos)
-    size = min(count, _CHUNK)
-    padded = np.minimum(np.arange(-(-count // size) * size), count - 1).reshape(-1, size)
-    # On the CPU, where the function compiles several times faster; it runs only once.
-    with on_host():
-        search = jax.jit(jax.vmap(closest))
-        chunks = [search(qpos[rows].astype(np.float32), qvel[rows].astype(np.float32)) for rows in padded]
-        distance, poses = (np.concatenate([np.asarray(chunk[i]) for chunk in chunks])[:count] for i in range(2))
-        return distance, poses

@@ -3,13 +3,15 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
+from mimic.arms.arrays import ArmArrays
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import pose_limits
 from mimic.metric.kinematics import LinkStates
-from mimic.metric.similarity import CentreLine, centre_line_table, similarity
+from mimic.metric.similarity import CentreLine, centre_line, centre_line_table, similarity
 from mimic.retargeting.pose_baselines import baseline_poses
 
 if TYPE_CHECKING:  # imports brax and MJX, which pose mappers do not need
@@ -82,18 +84,28 @@ def _violations(arm: Embodiment, qpos: np.ndarray, qvel: np.ndarray, torque: np.
     return {f"{name}_violations": (~flags.all(axis=-1)).sum(axis=1) for name, flags in within.items()}
 
 
+def speed_violations(arms: ArmArrays, qvel: Float[np.ndarray, "rows time joints"]) -> Float[np.ndarray, " rows"]:
+    """Fraction of the steps after which a joint exceeds its velocity limit, for the arm of each row."""
+    limit = np.asarray(arms.velocity_limit)[:, None] * np.float32(1 + _ROUNDING)
+    is_slow = np.abs(qvel) <= limit  # False for NaN too
+    return (~is_slow & (np.asarray(arms.is_free)[:, None] > 0)).any(axis=-1).mean(axis=1)
+
+
 def measure_similarity(
-    expert: CentreLine, learner: Embodiment, qpos: Float[np.ndarray, "demonstrations time joints"]
+    expert: CentreLine, learner: Embodiment | ArmArrays, qpos: Float[np.ndarray, "demonstrations time joints"]
 ) -> Table:
     """Computes the columns of the measures of `mimic.metric.similarity`, means over time.
 
     Args:
       expert: centre lines of the demonstrations, [demonstrations, time, samples, 3].
-      learner: the learner.
+      learner: the learner, or the arm of each row.
       qpos: its joint angles at the same times [rad].
     """
-    values = similarity(expert, centre_line_table(learner, qpos))
-    return {name: value.mean(axis=1, dtype=float) for name, value in values.items()}
+    if isinstance(learner, ArmArrays):
+        line = jax.tree.map(np.asarray, jax.jit(jax.vmap(centre_line))(learner, qpos))
+    else:
+        line = centre_line_table(learner, qpos)
+    return {name: value.mean(axis=1, dtype=float) for name, value in similarity(expert, line).items()}
 
 
 def means_by_split(tables: Mapping[str, Table], parts: Mapping[str, slice]) -> dict[str, dict[str, dict[str, float]]]:

@@ -14,7 +14,6 @@ from mimic.trainers.fine_tuning import with_one_learner
 from mimic.trainers.trainer import Trainer
 
 if TYPE_CHECKING:
-    from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer
     from mimic.trainers.ppo.trainer import PolicyOfManyArms, PPOTrainer
 
 
@@ -42,22 +41,11 @@ def make_ppo_trainer(
     unseen: Demonstrations | None = None,
     shared: "PolicyOfManyArms | None" = None,
 ) -> "PPOTrainer":
-    """The trainer of a config with trainer=ppo and one learner; see `PPOTrainer`."""
+    """The trainer of a config with trainer=ppo; see `PPOTrainer`."""
     compat.import_mjx()
     from mimic.trainers.ppo.trainer import PPOTrainer  # brax and MJX, which take seconds to import
 
-    config.env.check_one_learner()
     return PPOTrainer(config, run_dir, unseen, shared)
-
-
-def make_any_arm_trainer(
-    config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None
-) -> "AnyArmPPOTrainer":
-    """The trainer of a config with trainer=ppo whose learner is drawn for each episode; see `AnyArmPPOTrainer`."""
-    compat.import_mjx()
-    from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer
-
-    return AnyArmPPOTrainer(config, run_dir, unseen)
 
 
 def make_policy_trainer(
@@ -83,13 +71,8 @@ def make_policy_trainer(
             f"learner: expected one arm for a run of many, env={config.env.name}, as in learner=panda locked=[2,4]"
         )
     of_one = dataclasses.replace(config, env=with_one_learner(config.env, learner, locked))
-    shared = make_any_arm_trainer(config, run_dir).shared_policy()
+    shared = make_ppo_trainer(config, run_dir).shared_policy()
     return of_one, make_ppo_trainer(of_one, run_dir, shared=shared)
-
-
-def _make_ppo_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
-    make = make_any_arm_trainer if config.env.kind == "sampled_arms" else make_ppo_trainer
-    return make(config, run_dir)
 
 
 def _make_pose_mapper_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
@@ -99,6 +82,6 @@ def _make_pose_mapper_trainer(config: TrainConfig, run_dir: Path | None) -> Trai
 
 
 _MAKERS: dict[str, Callable[[TrainConfig, Path | None], Trainer]] = {
-    "ppo": _make_ppo_trainer,
+    "ppo": make_ppo_trainer,
     "pose_mapper": _make_pose_mapper_trainer,
 }

@@ -10,12 +10,12 @@ from mimic.commands.config import EvaluateConfig, RenderConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.runs.checkpoints import save_checkpoint
 from tests.helpers.run_directories import write_run
-from tests.helpers.untrained_family import COUNT, HELD_OUT, HORIZON, untrained_family
+from tests.helpers.untrained_run import FAMILY, family, untrained_run
 
 
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory):
-    return untrained_family(tmp_path_factory.mktemp("runs") / "run")
+    return untrained_run(tmp_path_factory.mktemp("runs") / "run", family())
 
 
 @pytest.mark.slow_for(
@@ -72,7 +72,7 @@ def test_one_arm_has_the_report_of_a_run_of_one_learner(run_dir, tmp_path):
     assert report["env"] == "panda_family-panda-locked-2" and report["physics"] == "fused"
     assert report["evaluated"]["learner"] == "panda" and report["evaluated"]["locked"] == [2]
     assert report["mjx"]["mean_distance"] == pytest.approx(report["mean_distance"], rel=1e-3)
-    assert len((out / "demonstrations.csv").read_text().splitlines()) == 1 + COUNT + HELD_OUT
+    assert len((out / "demonstrations.csv").read_text().splitlines()) == 1 + sum(FAMILY["demonstrations"].values())
     prepare_evaluation(EvaluateConfig(str(run_dir), controller="hold", mass=1.2, **options), 0.0)()
 
 
@@ -83,4 +83,4 @@ def test_a_video_shows_the_policy_on_one_arm(run_dir):
     assert plan.out == run_dir / "videos" / "panda_family-panda-locked-2-held_out-0.mp4"
     assert [poses.shape[1] for poses in clip.poses] == [7, 6]
     bound, policy = (next(c.values for c in clip.curves if c.label == key) for key in ("kinematic bound", "policy"))
-    assert len(policy) == HORIZON and np.all(bound <= policy + 1e-6)
+    assert len(policy) == FAMILY["horizon"] and np.all(bound <= policy + 1e-6)

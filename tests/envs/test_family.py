@@ -12,7 +12,7 @@ from mimic.arms.embodiment import panda_path
 from mimic.envs.family import SEEN, UNSEEN, arm_name, arm_sampler, report_arms
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.envs.wrappers import wrap_for_training
-from tests.helpers.untrained_family import family
+from tests.helpers.untrained_run import family
 
 FAMILIES = "panda_family", "any_arm"
 SMALL = {"demonstrations": {"count": 2, "held_out": 1}, "horizon": 5}

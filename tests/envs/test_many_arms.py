@@ -46,7 +46,7 @@ def panda():
 
 @pytest.fixture(scope="module")
 def env(config, motions):
-    return AnyArmEnv(config, random_arm, motions[0])
+    return AnyArmEnv(config, motions[0], random_arm)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +116,7 @@ def test_the_controller_rejects_what_arrays_do_not_cover():
 def compared(config, motions):
     """An environment with the relative reward."""
     arms = dataclasses.replace(config.arms, reward="relative")
-    return AnyArmEnv(dataclasses.replace(config, arms=arms), random_arm, motions[0])
+    return AnyArmEnv(dataclasses.replace(config, arms=arms), motions[0], random_arm)
 
 
 @pytest.mark.slow
@@ -177,7 +177,7 @@ def test_a_runaway_ends_and_is_charged_for_all_remaining_steps(env, four_joints,
 def test_each_episode_has_a_new_arm(config, motions, panda):
     """In a batch, from random steps on, as in training."""
     masks = lock_masks(7, 1)
-    env = AnyArmEnv(config, lock_sampler(panda, masks), motions[0])
+    env = AnyArmEnv(config, motions[0], lock_sampler(panda, masks))
     wrapped = fresh_episodes(cast(Any, env))
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(1), 8))
     step = jax.jit(wrapped.step)
@@ -261,7 +261,7 @@ def test_arms_that_are_not_done_go_on_as_without_a_restart(env, zero_actions):
 def test_observations_know_nothing_of_the_expert_after_the_next_step(env, four_joints):
     def observed(env):
         start = env.at_step(env.start_of(four_joints, 0, jax.random.PRNGKey(0)), 5)
-        return env.observe(start), env.torque(start, jnp.zeros(env.action_size))
+        return env.observe(start), env.command(start, jnp.zeros(env.action_size))
 
     later = jax.tree.map(lambda x: x.at[:, 7:].add(1.0), env.expert_states)
     next_step = jax.tree.map(lambda x: x.at[:, 6].add(1.0), env.expert_states)

@@ -12,7 +12,8 @@ import mimic
 from mimic.envs.imitation import layout_of
 from mimic.envs.make import make_env
 from mimic.envs.wrappers import fresh_episodes
-from mimic.evaluation.evaluator import Evaluator, References
+from mimic.evaluation.evaluator import Evaluator
+from mimic.evaluation.references import References
 from mimic.metric.capsule_distances import capsule_axes
 from mimic.metric.kinematics import link_state_table
 from mimic.trainers.config import TrainConfig

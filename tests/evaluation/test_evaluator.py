@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 
 import mimic
 from mimic.envs.imitation import training_and_held_out
-from mimic.evaluation import evaluator as evaluation
-from mimic.evaluation import plots
+from mimic.evaluation import plots, references
 from mimic.evaluation.evaluator import Evaluator, Rollouts
 from mimic.evaluation.rollout_metrics import gap_interval, gaps, has_gap, measure
 from mimic.evaluation.tracking_controllers import run_controller
@@ -289,7 +288,7 @@ def test_actions_out_of_range_get_the_maximum_torque(evaluator):
 
 
 def test_the_bound_of_an_equal_arm_needs_no_search(monkeypatch):
-    monkeypatch.setattr(evaluation, "closest_motion", None)  # would fail
+    monkeypatch.setattr(references, "closest_motion", None)  # would fail
     config = mimic.env_config("panda7dof", demonstrations={"count": 2, "held_out": 1})
     training, held_out = training_and_held_out(config)
     evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
@@ -312,7 +311,7 @@ def test_no_rollout_goes_below_the_bound():
 
 def test_one_demonstration_has_the_references_that_it_has_among_all(evaluator):
     one = evaluator.only(COUNT + 1)
-    assert len(one.lower_bound) == 1 and one.parts["held_out"] == slice(0, None)
+    assert len(one.lower_bound) == 1 and one.parts["held_out"] == slice(0, 1)
     np.testing.assert_array_equal(one.lower_bound[0], evaluator.lower_bound[COUNT + 1])
     np.testing.assert_allclose(one.hold_distance[0], evaluator.hold_distance[COUNT + 1], rtol=1e-5)  # float32
 

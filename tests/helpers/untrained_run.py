@@ -1,4 +1,4 @@
-"""A run directory of a policy with its initial parameters."""
+"""Run directories of policies of one arm and of many, with their initial parameters."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,6 +18,8 @@ from mimic.trainers.run_models import save_models
 from tests.helpers.tiny import SHORT_ARMS
 
 COUNT, HELD_OUT, HORIZON = 4, 2, 20
+FAMILY = {"demonstrations": {"count": 3, "held_out": 2}, "horizon": 5}
+ARMS = {"most_locked": 1, "unseen": ["2", "3", "4", "5", "6"]}  # seen: whole, and joint 1 or 7 locked
 
 
 def environment(learner: Sequence[float] = (0.5, 0.5), model: str = "planar") -> EnvConfig:
@@ -31,14 +33,25 @@ def environment(learner: Sequence[float] = (0.5, 0.5), model: str = "planar") ->
     )
 
 
-def untrained_run(folder: Path, **settings: Any) -> Path:
-    """What a training run leaves, but with its initial parameters: no training is compiled."""
-    ppo = PPOConfig(hidden_layers=[8], preset="cpu")
-    config = TrainConfig(environment(**settings), ppo, compilation_cache="").resolve()
+def family(**changes: Any) -> EnvConfig:
+    """The environment of few Pandas with locked joints, of short episodes."""
+    arms = {**ARMS, **changes.pop("arms", {})}
+    return mimic.env_config("panda_family", arms=arms, **FAMILY, **changes)
+
+
+def untrained_run(folder: Path, env: EnvConfig | None = None, **settings: Any) -> Path:
+    """What a training run leaves, but with its initial parameters: no training is compiled.
+
+    Args:
+      folder: of the run.
+      env: the environment; that of `environment` with these settings where None.
+      settings: of `environment`.
+    """
+    config = TrainConfig(env or environment(**settings), PPOConfig(hidden_layers=[8]), compilation_cache="").resolve()
     trainer = PPOTrainer(config, None)
     folder.mkdir()
     save_models(folder, config.env)
-    save_config(folder, dataclasses.replace(config, trainer=trainer.settings))
+    save_config(folder, dataclasses.replace(config, env=trainer.env_config, trainer=trainer.settings))
     trainer.save_inputs(folder)
     env = trainer.evaluator.env
     networks = make_networks(trainer.settings, env.observation_size, env.action_size)

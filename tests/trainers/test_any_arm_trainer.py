@@ -9,15 +9,15 @@ import pytest
 import mimic
 from mimic.commands.fit import Run
 from mimic.envs.family import arms_config
-from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS
 from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer
-from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer
+from mimic.trainers.ppo.trainer import EVALUATED_DEMONSTRATIONS
 from mimic.trainers.run_config import load_config
 from tests.helpers.commands import command
-from tests.helpers.untrained_family import ARMS, COUNT, HELD_OUT, family
+from tests.helpers.untrained_run import ARMS, family
 
+COUNT, HELD_OUT = 3, 2
 TINY = [
     "env=panda_family",
     "env.horizon=5",
@@ -48,8 +48,7 @@ def trainer():
     return make_trainer(TrainConfig(env, PPOConfig(hidden_layers=[8], preset="cpu", crossovers=4)), None)
 
 
-def test_it_is_chosen_where_the_learner_is_drawn(trainer):
-    assert isinstance(trainer, AnyArmPPOTrainer)
+def test_it_evaluates_the_arms_of_the_report(trainer):
     assert trainer.headline == f"panda_family: {COUNT} demonstrations, 512 arms in parallel"
     assert "report: 3 arms seen in training and 5 others, on 8 held-out demonstrations" in trainer.simulation
     assert trainer.env_config.physics == "fused" and trainer.columns == ("seen arms", "unseen arms")

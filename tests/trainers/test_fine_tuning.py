@@ -8,12 +8,12 @@ from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.fine_tuning import fine_tuned, with_one_learner
 from mimic.trainers.run_config import save_config
 from tests.helpers.run_directories import write_run
-from tests.helpers.untrained_family import HORIZON, family, untrained_family
+from tests.helpers.untrained_run import FAMILY, family, untrained_run
 
 
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory):
-    return untrained_family(tmp_path_factory.mktemp("runs") / "run")
+    return untrained_run(tmp_path_factory.mktemp("runs") / "run", family())
 
 
 def requested(init, **fields):
@@ -27,7 +27,7 @@ def test_the_learner_is_the_only_arm(run_dir):
     arms = config.env.arms
     assert arms == ArmsConfig(locked_fraction=1.0, most_locked=0)
     assert config.env.name == "panda_family-panda" and config.env.learner.model == "panda"
-    assert config.env.learner.armature == 0.1 and config.env.horizon == HORIZON
+    assert config.env.learner.armature == 0.1 and config.env.horizon == FAMILY["horizon"]
     assert isinstance(config.trainer, PPOConfig)
     assert config.trainer.num_timesteps == 1000 and config.trainer.hidden_layers == [8]
     assert (config.seed, config.run_dir, config.init, config.learner) == (3, "runs/new", str(run_dir), "panda")

@@ -1,29 +1,32 @@
-"""`trainer=ppo`: trains a policy that imitates the expert's motions by joint torques."""
+"""`trainer=ppo`: trains a policy that imitates the expert's motions, of one learner or of many."""
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from mimic.base.compilation import Background, compiling, on_host
 from mimic.envs.config import EnvConfig
+from mimic.envs.family import SEEN, UNSEEN, report_arms
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.envs.make import make_env
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
-from mimic.evaluation.labels import ALL_KINDS, SPLITS
-from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
-from mimic.evaluation.rollout_metrics import MIN_SPAN
+from mimic.evaluation.nearest_pose_controller import ControllerWithMemory, nearest_pose_controller
 from mimic.motions.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.ppo import ppo
+from mimic.trainers.ppo import ppo, report_rows
 from mimic.trainers.trainer import Metrics, OnEvaluation, Params, Row, Trainer
+
+EVALUATED_DEMONSTRATIONS = 8  # of the held-out ones, by each of many arms: with 29 arms, 232 rollouts and bounds
+_VALIDATION = 64  # training demonstrations by which a fine-tuning chooses its result: one arm, so they cost little
 
 
 class PolicyOfManyArms(NamedTuple):
@@ -41,11 +44,15 @@ class PolicyOfManyArms(NamedTuple):
 class PPOTrainer(Trainer):
     """Trains a policy on the training demonstrations, and evaluates it on these and on held-out ones.
 
+    A policy of many arms is evaluated on those of `report_arms`, on held-out demonstrations. The result of its
+    fine-tuning on one arm is the checkpoint with the smallest mean distance on training demonstrations, the start among
+    them, as training can make it worse.
+
     Args:
       config: the run's config.
       run_dir: directory of an existing run, whose demonstrations are used.
       unseen: demonstrations to evaluate on instead of the held-out ones.
-      shared: the policy, where it was trained on many arms; it can be evaluated, and not trained.
+      shared: the policy, where it was trained on many arms and is evaluated on one; it cannot be trained.
 
     Attributes:
       evaluator: evaluates controllers on the run's demonstrations.
@@ -72,7 +79,6 @@ class PPOTrainer(Trainer):
             unseen.check_fits(env.expert, config.env.control_dt, unseen.horizon)
             check_effort(unseen, env.expert)
             env, held_out = env.with_horizon(unseen.horizon), unseen
-        self.evaluator = Evaluator(env, held_out)
         mixed = with_crossovers(env.demonstrations, self.settings.crossovers, config.env.demonstrations.seed)
         self._env = env if mixed is env.demonstrations else env.with_demonstrations(mixed)
         self._demonstrations = concatenate(env.demonstrations, held_out)
@@ -83,8 +89,31 @@ class PPOTrainer(Trainer):
         self.simulation = f"physics: {env.physics.name} ({env.physics.reason})"
         if self._is_cross_checked:
             self.simulation += "; the report evaluates the policy on MJX too"
+        self._validation: Demonstrations | None = None
+        if self._has_many_arms:
+            self._evaluate_many_arms(config, held_out.select(slice(0, EVALUATED_DEMONSTRATIONS)))
+            if config.learner and unseen is None:
+                self._validation = env.demonstrations.select(slice(0, _VALIDATION))
+        else:
+            self.evaluator = Evaluator(env, held_out)
+        self._last: tuple[Params, Rollouts | None] = None, None  # parameters and their rollouts
         self._rollouts = Background(self._compile)
         self._rollouts_on_mjx = Background(self._compile_on_mjx)
+
+    def _evaluate_many_arms(self, config: TrainConfig, evaluated: Demonstrations) -> None:
+        """Makes the evaluator of many arms."""
+        arms = report_arms(config.env)
+        self._controller_rollouts = Background(self._run_controller)
+        self.evaluator = Evaluator(self._env, evaluated, arms, lambda: self._controller_rollouts())
+        self.columns = "seen arms", "unseen arms"
+        self.simulation += (
+            f"\nreport: {len(arms[SEEN])} arms seen in training and {len(arms[UNSEEN])} others, on {evaluated.count} "
+            "held-out demonstrations"
+        )
+
+    @property
+    def _has_many_arms(self) -> bool:
+        return self.env_config.kind == "sampled_arms"
 
     def save_inputs(self, run_dir: Path) -> None:
         """Writes the demonstrations."""
@@ -104,12 +133,27 @@ class PPOTrainer(Trainer):
 
     def policy(self, params: Params) -> Callable[[Any], Any]:
         """The deterministic policy: observation -> action in [-1, 1]."""
+        return jax.jit(self._policy(params))
+
+    def _policy(self, params: Params) -> Callable[[Any], Any]:
         controller = self.controller(params)
-        return jax.jit(lambda observation: controller(SimpleNamespace(obs=observation)))  # type: ignore[arg-type]
+        return lambda observation: controller(SimpleNamespace(obs=observation))  # type: ignore[arg-type]
+
+    def shared_policy(self) -> PolicyOfManyArms:
+        """The policy of many arms, to evaluate it on one."""
+
+        def controller(env: ImitationEnv, params: Params) -> ControllerWithMemory:
+            return nearest_pose_controller(env, self._policy(params))
+
+        return PolicyOfManyArms(self.params_template, controller)
 
     def _compile(self) -> Callable[[Params], Rollouts]:
+        demonstrations = None
+        if self._validation is not None:  # in one function with the report's, which takes long to compile
+            demonstrations = concatenate(self._validation, self.evaluator.env.demonstrations)
+
         def rollouts(params: Params) -> Rollouts:
-            return self.evaluator.rollout(self.controller(params))
+            return self.evaluator.rollout(self.controller(params), demonstrations)
 
         return compiling(rollouts, self._params_shapes())()
 
@@ -129,8 +173,10 @@ class PPOTrainer(Trainer):
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template)
 
     def prepare_evaluation(self) -> None:
-        """Starts to compile the evaluation, and to compute the bound and the baselines."""
+        """Starts to compile the evaluation, and to compute the bound and the baselines, in this order."""
         self._rollouts.start()
+        if self._has_many_arms:
+            self._controller_rollouts.start()
         self.evaluator.prepare()
 
     def train(
@@ -153,6 +199,7 @@ class PPOTrainer(Trainer):
             signals=signals,
             restored=restored,
             on_compiling=self.prepare_evaluation,
+            score=None if self._validation is None else self._validation_distance,
         )
 
     def follow(self, restored: Checkpoint | None) -> None:
@@ -160,13 +207,38 @@ class PPOTrainer(Trainer):
         ppo.follow(self._env, self.settings, seed=self._seed, restored=restored)
 
     def evaluate(self, params: Params) -> Rollouts:
-        """Runs the deterministic policy once on each demonstration."""
-        # Parameters come from the host: each sharding over devices would need a compiled function of its own.
-        return self._rollouts()(jax.device_get(params))
+        """Runs the deterministic policy once on each demonstration, of many arms with each of them."""
+        return jax.tree.map(lambda x: x[self._validated :], self._run(params))
+
+    @property
+    def _validated(self) -> int:
+        """Number of rollouts on validation demonstrations, which are the first ones."""
+        return 0 if self._validation is None else self._validation.count
+
+    def _validation_distance(self, params: Params) -> float:
+        """The mean distance on validation demonstrations."""
+        return float(np.mean(self._run(params).distance[: self._validated], dtype=float))
+
+    def _run(self, params: Params) -> Rollouts:
+        """The rollouts on validation demonstrations, of which there may be none, and on those of the report."""
+        last, rollouts = self._last
+        if rollouts is None or last is not params:  # a checkpoint is evaluated, then compared
+            # Parameters come from the host: each sharding over devices would need a compiled function of its own.
+            rollouts = jax.device_get(self._rollouts()(jax.device_get(params)))
+            self._last = params, rollouts
+        return rollouts
+
+    def _run_controller(self) -> Rollouts:
+        """The rollouts of the zero action: that of networks whose parameters are 0."""
+        statistics, *networks = self._params_shapes()
+        idle = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), statistics)
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), networks)
+        rollouts = jax.device_get(self._rollouts()((idle, *zeros)))
+        return jax.tree.map(lambda x: x[self._validated :], rollouts)
 
     @property
     def _is_cross_checked(self) -> bool:
-        return self.env_config.physics != "mjx"
+        return self.env_config.physics != "mjx" and not self._has_many_arms
 
     def cross_check(self, params: Params) -> Metrics:
         """Gap and distance of the policy on MJX, an engine that is not ours; nothing where the training was on it."""
@@ -178,9 +250,12 @@ class PPOTrainer(Trainer):
         return {"mjx": {key: summary[key] for key in ("optimality_gap", "mean_distance")}}
 
     def run_controller(self, name: str, params: Params) -> tuple[Rollouts, dict[str, Any]]:
-        """See `mimic.evaluation.tracking_controllers.run_controller`."""
+        """See `mimic.evaluation.tracking_controllers.run_controller`; of many arms "policy" or "nearest_pose"."""
         if name == "policy":
             return self.evaluate(params), {}
+        if self._has_many_arms:
+            assert name == "nearest_pose", name
+            return self._controller_rollouts(), {"trainer": name}
         from mimic.evaluation.tracking_controllers import run_controller
 
         outcome, setting = run_controller(self.evaluator, name)
@@ -191,101 +266,49 @@ class PPOTrainer(Trainer):
         return self.evaluator.summary(outcome)
 
     def status(self, metrics: Metrics) -> str:
-        """Distance and optimality gap."""
-        gap, distance = metrics["optimality_gap"], metrics["mean_distance"]["train"]
-        percent = {split: _text("{:.1%}", value) for split, value in gap.items()}
-        return f"distance {distance:.4f}  gap {percent['train']}, held out {percent['held_out']}"
+        """See `report_rows.status`."""
+        return report_rows.status(metrics)
 
     def good_enough(self, metrics: Metrics) -> bool:
-        """Whether the target gap is reached on the training demonstrations."""
-        return metrics["optimality_gap"]["train"] <= self.settings.target_gap
+        """Whether the target gap is reached on the training demonstrations, or by the arms seen in training."""
+        return 0 < self.settings.target_gap >= metrics["optimality_gap"].get("train", np.inf)
 
     def details(self, outcome: Rollouts, controller: str = "policy") -> Metrics:
-        """Physics, similarity of the motions compared with the baselines, demonstrations with the largest gaps."""
-        return {
+        """Physics, similarity of the motions and the baselines, and the worst motions, or a row of each arm."""
+        details = {
             "physics": self.env_config.physics,
             "similarity": self.evaluator.similarity_summary(outcome, controller),
-            "worst_demonstrations": self.evaluator.worst(outcome),
         }
+        if not self._has_many_arms:
+            return {**details, "worst_demonstrations": self.evaluator.worst(outcome)}
+        count = self.evaluator.env.demonstrations.count
+        return {**details, "evaluated_demonstrations": count, "arms": self.evaluator.details(outcome)}
 
     def rows(self, metrics: Metrics) -> list[Row]:
-        """Rows of the gap, the distances that define it, and the other metrics."""
-        by_split = (
-            ("optimality gap", "optimality_gap", "{:.2%}"),
-            ("mean distance", "mean_distance", "{:.4f}"),
-            ("  kinematic bound (gap 0)", "lower_bound", "{:.4f}"),
-            ("  holding start pose (1)", "hold_distance", "{:.4f}"),
-            ("angle to expert links", "link_angle_error_deg", "{:.1f} deg"),
-            ("angular velocity error", "angular_velocity_error", "{:.2f} rad/s"),
-            ("torque / maximum, rms", "torque_rms", "{:.1%}"),
-            ("  change in a step, rms", "torque_change", "{:.1%}"),
-            ("  steps at the maximum", "torque_saturation", "{:.1%}"),
-            ("steps out of range", "position_violations", "{:.0f}"),
-            ("  above velocity limit", "speed_violations", "{:.0f}"),
-            ("  above torque limit", "torque_violations", "{:.0f}"),
-        )
-        rows: list[Row] = [
-            (label, _text(form, metrics[key]["train"]), _text(form, metrics[key]["held_out"]))
-            for label, key, form in by_split
-        ]
-        rows[1:1] = _rows_of_kinds(metrics["by_kind"])
-        rows += [
-            (
-                f"reward term {key.removeprefix('reward.')}",
-                _text("{:.4f}", value["train"]),
-                _text("{:.4f}", value["held_out"]),
-            )
-            for key, value in metrics.items()
-            if key.startswith("reward.")
-        ]
-        if "mjx" in metrics:
-            on_mjx = {split: _text("{:.2%}", gap) for split, gap in metrics["mjx"]["optimality_gap"].items()}
-            rows.insert(1, ("  evaluated on MJX", on_mjx["train"], on_mjx["held_out"]))
-        if not all(math.isfinite(gap) for gap in metrics["optimality_gap"].values()):
-            rows.insert(1, ("  none: the best motion saves less than", f"{MIN_SPAN:.0%} of holding", "the start pose"))
-        train, held_out = (
-            "  ".join(f"{i}: {gap:.0%}" for i, gap in metrics["worst_demonstrations"][split].items())
-            for split in SPLITS
-        )
-        return [*rows, ("worst (number: gap)", train, held_out)]
+        """See `report_rows`."""
+        return report_rows.rows(metrics)
 
     def save_outcome(self, folder: Path, outcome: Rollouts, controller: str = "policy") -> None:
         """Writes tables and plots of the evaluation; in a run directory also a plot of the training."""
         from mimic.evaluation import plots  # imports matplotlib, which takes a second
 
-        self.evaluator.save_table(outcome, folder / "demonstrations.csv")
-        self.evaluator.save_curves(outcome, folder / "quality.csv")
-        names = {"controller": controller.replace("_", " "), "title": self._name}
-        plots.plot_quality(self.evaluator, outcome, folder / "quality.png", **names)
-        plots.plot_demonstrations(self.evaluator, outcome, folder / "demonstrations.png", **names)
-        plots.plot_similarity(
-            self.evaluator.similarity_summary(outcome, controller), folder / "similarity.png", title=self._name
-        )
+        name, label = controller.replace("_", " "), "optimality gap [%]"
         labels = plots.labels_of("demonstrations")
-        plots.plot_training(folder, "optimality_gap", "optimality gap [%]", labels=labels, title=self._name)
-
-
-def _rows_of_kinds(by_kind: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[Row]:
-    """Rows of the gap of each kind of demonstrations, and of the interval of all."""
-
-    def cells(kind: str, text: Callable[[Mapping[str, float]], str]) -> Row:
-        train, held_out = (text(of[split]) if split in (of := by_kind[kind]) else "" for split in SPLITS)
-        return f"  {kind.replace('_', ' ')}", train, held_out
-
-    def interval(numbers: Mapping[str, float]) -> str:
-        return f"{100 * numbers['low']:.2f} to {100 * numbers['high']:.2f}%" if numbers["low"] == numbers["low"] else ""
-
-    intervals = cells(ALL_KINDS, interval)[1:]
-    if not any(intervals):
-        return []  # there is no gap
-    rows: list[Row] = [("  95 % interval", *intervals)]
-    if len(kinds := [kind for kind in by_kind if kind != ALL_KINDS]) > 1:
-        rows += [cells(kind, lambda numbers: _text("{:.2%}", numbers["optimality_gap"])) for kind in kinds]
-    return rows
-
-
-def _text(form: str, value: float) -> str:
-    return form.format(value) if math.isfinite(value) else "none"
+        if self._has_many_arms:
+            self.evaluator.save_arms(outcome, folder / "arms.csv")
+            series = {"gap": name, "controller_gap": "controller without learning"}
+            arms = self.evaluator.details(outcome)
+            plots.plot_arms(arms, series, folder / "arms.png", label=label, title=self._name)
+            labels = {"train": "arms seen in training", "held_out": "unseen arms"}
+        else:
+            self.evaluator.save_table(outcome, folder / "demonstrations.csv")
+            self.evaluator.save_curves(outcome, folder / "quality.csv")
+            names = {"controller": name, "title": self._name}
+            plots.plot_quality(self.evaluator, outcome, folder / "quality.png", **names)
+            plots.plot_demonstrations(self.evaluator, outcome, folder / "demonstrations.png", **names)
+            similarity = self.evaluator.similarity_summary(outcome, controller)
+            plots.plot_similarity(similarity, folder / "similarity.png", title=self._name)
+        plots.plot_training(folder, "optimality_gap", label, labels=labels, title=self._name)
 
 
 def run_environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:

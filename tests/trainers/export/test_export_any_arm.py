@@ -16,11 +16,11 @@ from mimic.arms.sampler import random_arm
 from mimic.envs.many_arms import any_arm_state
 from mimic.retargeting.array_goals import random_numbers
 from mimic.runs.checkpoints import load_checkpoint, save_checkpoint
-from mimic.trainers.make import make_any_arm_trainer
+from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.pose_mapper.mapper_arm import describe_arm
 from mimic.trainers.run_config import load_config
 from tests.helpers.random_arms import random_arm as random_model
-from tests.helpers.untrained_family import HORIZON, untrained_family
+from tests.helpers.untrained_run import FAMILY, family, untrained_run
 
 pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -29,7 +29,7 @@ DYNAMICS = {"has_dynamics": True}
 
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory):
-    return untrained_family(tmp_path_factory.mktemp("runs") / "run")
+    return untrained_run(tmp_path_factory.mktemp("runs") / "run", family())
 
 
 def described(run_dir, out, **options):
@@ -94,7 +94,7 @@ def test_an_arm_that_evaluate_rejects_has_no_description(run_dir, reason, tmp_pa
 def test_an_onnx_policy_of_any_arm_equals_the_environment(run_dir, tmp_path):
     """An episode of three arms: the torques of the file in the states of the environment, with a memory of its own."""
     trained = load_config(run_dir)
-    trainer = make_any_arm_trainer(trained, run_dir)
+    trainer = make_ppo_trainer(trained, run_dir)
     statistics, *networks = load_checkpoint(run_dir, trainer.params_template(), 0)[1]
     rng = np.random.default_rng(0)  # the initial actions are 0
     networks = jax.tree.map(lambda x: x + 0.2 * rng.normal(size=x.shape).astype(x.dtype), networks)
@@ -115,7 +115,7 @@ def test_an_onnx_policy_of_any_arm_equals_the_environment(run_dir, tmp_path):
     @jax.vmap
     def step(state):
         action = jnp.clip(policy(state.obs), -1, 1)
-        torques = [env.torque(any_arm_state(state), used) for used in (action, jnp.zeros(MAX_JOINTS))]
+        torques = [env.command(any_arm_state(state), used) for used in (action, jnp.zeros(MAX_JOINTS))]
         return env.step(state, action), torques
 
     state = start(arms)
@@ -124,7 +124,7 @@ def test_an_onnx_policy_of_any_arm_equals_the_environment(run_dir, tmp_path):
     learner = np.stack(vectors)
     part(learner, "torque_limit")[:] = at_start.max_torque
     memory = np.tile(at_start.qpos, (1, session.get_inputs()[5].shape[1] // MAX_JOINTS))
-    for number in range(HORIZON):
+    for number in range(FAMILY["horizon"]):
         now = any_arm_state(state)
         inputs = {
             "expert_qpos": motions.qpos[1, number + 1], "expert_qvel": motions.qvel[1, number + 1],
