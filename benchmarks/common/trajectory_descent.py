@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mimic.envs.imitation import ImitationEnv
+from mimic.envs.imitation import ImitationEnv, limit_excess
 from mimic.metric.distance import PARTS, PairDistances, Weights, pair_distances
 from mimic.metric.kinematics import LinkStates, link_states
 from mimic.physics.step import Load, make_advance
@@ -166,7 +166,7 @@ class TrajectoryDescent:
 
     def _penalty(self, qpos: Array, qvel: Array) -> Array:
         weight = self._env.limit_penalty_weight
-        return weight * self._env.limit_excess(qpos, qvel) if weight else jnp.zeros(())
+        return weight * limit_excess(self._env.learner, qpos, qvel) if weight else jnp.zeros(())
 
     def _linearize(self, task: Task, episodes: Episodes) -> _Model:
         """Models of all sequences, computed a few sequences at a time."""

@@ -17,6 +17,7 @@ from brax.envs.base import Env, State
 from jaxtyping import Array, Bool, Float, Int
 
 from mimic.arms.arm import Arm, build_arm, torque_scale
+from mimic.arms.arrays import ArmArrays
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.drives import drives_of
 from mimic.arms.embodiment import Embodiment
@@ -26,7 +27,7 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.start_poses import home_poses, nearest_poses
 from mimic.envs.terms import Transition, observation_layout_of_terms, observation_terms, observed, reward_terms
 from mimic.metric.capsule_distances import changing_pairs
-from mimic.metric.distance import LinkDistance
+from mimic.metric.distance import LinkDistance, Metric
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 from mimic.motions.demonstrations import RECORDED_SPEED, Demonstrations, check_effort, load_demonstrations
 from mimic.motions.experts import KINDS, MIXED
@@ -75,8 +76,6 @@ class ImitationEnv(Env):
     Raises:
       ValueError: arms or demonstrations that do not fit the config.
     """
-
-    _metrics: tuple[str, ...] = "distance", "limit_excess", "torque_saturation", "runaway"  # of a step
 
     def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None):
         compat.mend_brax()  # here: brax's trainers take any environment, wrapped by any function
@@ -172,7 +171,8 @@ class ImitationEnv(Env):
     def begin(self, arm_state: ArmState) -> State:
         """The brax state of an episode that starts in a state of `start`."""
         zero = jnp.zeros(())
-        metrics = dict.fromkeys((*self._metrics, *(term.metric for term in self.reward_terms)), zero)
+        metrics = {"distance": zero, "limit_excess": zero, "torque_saturation": zero, "runaway": zero}
+        metrics |= {term.metric: zero for term in self.reward_terms}
         return State(arm_state, self.observe_start(arm_state), zero, zero, metrics, {})
 
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> ArmState:
@@ -197,18 +197,27 @@ class ImitationEnv(Env):
         minimum, maximum = (jnp.array(bounds) for bounds in zip(mass, damping, strict=True))
         return Load(*jax.random.uniform(key, (2,), minval=minimum, maxval=maximum))
 
-    def step(self, state: State, action: Float[Array, " joints"]) -> State:
-        """Advances an episode by one control step."""
+    def step(self, state: State, action: Float[Array, " numbers"]) -> State:
+        """Advances an episode by one control step.
+
+        Raises:
+          ValueError: an action of another length.
+        """
+        if action.shape != (self.action_size,):
+            raise ValueError(f"action: expected shape ({self.action_size},), got {action.shape}")
         before = arm_state(state)
         command = jnp.clip(action, -1.0, 1.0)
         after, torque = self._simulate(before, command)
-        qpos, qvel, step = after.qpos, after.qvel, after.step
-        runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # True for NaN too
-        states = link_states(self.learner, qpos, qvel)
-        expert_states = self.expert_at(before.demonstration, step)
-        distance = jnp.where(runaway, self._worst_distance, self.states_distance(expert_states, states))
-        excess = jnp.where(runaway, 1.0, self.limit_excess(qpos, qvel))
-        steps, done = self._charged_steps(runaway, step)
+        learner, qpos, qvel = self.learner_in(after), after.qpos, after.qvel
+        runaway = self._is_runaway(after)
+        states = link_states(learner, qpos, qvel)
+        expert_states = self.expert_at(before.demonstration, after.step)
+        distance = jnp.where(runaway, self._runaway_distance(after), self.metric_in(after)(expert_states, states))
+        excess = jnp.where(runaway, 1.0, limit_excess(learner, qpos, qvel))
+        # A runaway is charged its penalty for all remaining steps, so that ending an episode early is never better.
+        remaining = (self.config.horizon - after.step).astype(jnp.float32)
+        steps = jnp.where(runaway, 1.0 + remaining, 1.0)
+        done = (runaway | (after.step >= self.config.horizon)).astype(jnp.float32)
         metrics = {
             **state.metrics,
             "distance": distance,
@@ -216,7 +225,7 @@ class ImitationEnv(Env):
             "torque_saturation": jnp.any(jnp.abs(command) > 0.99).astype(jnp.float32),
             "runaway": runaway.astype(jnp.float32),
         }
-        reward = -(distance + self.limit_penalty_weight * excess) * steps
+        reward = self._reward(before, after, distance, excess) * steps
         transition = Transition(before, after, command, torque, states, expert_states)
         for term in self.reward_terms:
             value = jnp.where(runaway, -np.sign(term.weight), term.value(self, transition))
@@ -225,15 +234,30 @@ class ImitationEnv(Env):
         obs = self._observe_states(after, states)
         return state.replace(pipeline_state=after, obs=obs, reward=reward, done=done, metrics=metrics)
 
-    def _charged_steps(
-        self, runaway: Bool[Array, ""], step: Int[Array, ""]
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The number of steps that the reward of a step counts for, and 1 where the episode is done.
+    def learner_in(self, state: ArmState) -> Embodiment | ArmArrays:
+        """The learner in a state: a constant, or what the state carries."""
+        del state
+        return self.learner
 
-        A runaway is charged its penalty for all remaining steps, so that ending an episode early is never better.
-        """
-        steps = jnp.where(runaway, 1.0 + (self.config.horizon - step), 1.0)
-        return steps, (runaway | (step >= self.config.horizon)).astype(jnp.float32)
+    def metric_in(self, state: ArmState) -> Metric:
+        """The metric between the expert and the learner in a state."""
+        del state
+        return self.metric
+
+    def _is_runaway(self, state: ArmState) -> Bool[Array, ""]:
+        return ~jnp.all(jnp.abs(state.qvel) < self.config.speed_bound)  # True for NaN too
+
+    def _runaway_distance(self, state: ArmState) -> Float[Array, ""] | float:
+        """The distance charged for each step of a runaway."""
+        del state
+        return self._worst_distance
+
+    def _reward(
+        self, before: ArmState, after: ArmState, distance: Float[Array, ""], excess: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        """The reward of a step that is no runaway, without `reward.terms`."""
+        del before, after
+        return -(distance + self.limit_penalty_weight * excess)
 
     def _simulate(
         self, before: ArmState, command: Float[Array, " numbers"]
@@ -278,17 +302,6 @@ class ImitationEnv(Env):
     def states_distance(self, expert_states: LinkStates, learner_states: LinkStates) -> Float[Array, ""]:
         """Embodiment distance between link states, in this environment's metric."""
         return self.metric(expert_states, learner_states)
-
-    def limit_excess(self, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"]) -> Float[Array, ""]:
-        """Mean over joints of the excess over position and velocity limits, in [0, 1].
-
-        It is 0 up to 0.03 rad, or 3 % of the velocity limit, before a limit, and 1 where all joints are 0.1 rad and
-        10 % further than that.
-        """
-        lower, upper = jnp.asarray(self.learner.joint_range, jnp.float32).T
-        position = jnp.maximum(qpos - upper, lower - qpos) + _LIMIT_MARGIN
-        speed = jnp.abs(qvel) / jnp.asarray(self.learner.velocity_limit, jnp.float32) - 1 + _LIMIT_MARGIN
-        return 0.5 * jnp.mean(jnp.clip(position / _LIMIT_WIDTH, 0, 1) + jnp.clip(speed / _LIMIT_WIDTH, 0, 1))
 
     @property
     def limit_penalty_weight(self) -> float:
@@ -362,6 +375,20 @@ class ImitationEnv(Env):
     def backend(self) -> str:
         """Name of the physics backend, for brax."""
         return self.physics.name
+
+
+def limit_excess(
+    arm: Embodiment | ArmArrays, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"]
+) -> Float[Array, ""]:
+    """Mean over joints of the excess over position and velocity limits, in [0, 1].
+
+    It is 0 up to 0.03 rad, or 3 % of the velocity limit, before a limit, and 1 where all joints are 0.1 rad and 10 %
+    further than that.
+    """
+    lower, upper = jnp.asarray(arm.joint_range, jnp.float32).T
+    position = jnp.maximum(qpos - upper, lower - qpos) + _LIMIT_MARGIN
+    speed = jnp.abs(qvel) / jnp.asarray(arm.velocity_limit, jnp.float32) - 1 + _LIMIT_MARGIN
+    return 0.5 * jnp.mean(jnp.clip(position / _LIMIT_WIDTH, 0, 1) + jnp.clip(speed / _LIMIT_WIDTH, 0, 1))
 
 
 def where_done(done: Float[Array, " batch"], new: Any, old: Any) -> Any:

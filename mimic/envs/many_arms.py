@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import State
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from mimic.arms.arm import Arm, build_arm
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
@@ -87,8 +87,6 @@ class AnyArmEnv(ImitationEnv):
       ValueError: settings that such an environment does not have, a metric or expert that arrays do not cover, or
         demonstrations that do not fit.
     """
-
-    _metrics = "distance", "runaway"
 
     def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None, sampler: Sampler | None = None):
         check_family(config)
@@ -180,40 +178,43 @@ class AnyArmEnv(ImitationEnv):
         """The metric between the expert and an arm."""
         return Metric(arc_length_correspondence(self.expert_arrays, arm), self._weights)
 
-    def step(self, state: State, action: Float[Array, " actions"]) -> State:
-        """Advances an episode by one control step of constant torque.
+    def learner_in(self, state: ArmState) -> ArmArrays:
+        """The learner in a state."""
+        return cast(AnyArmState, state).arm
 
-        Raises:
-          ValueError: an action of another length.
-        """
-        if action.shape != (self.action_size,):
-            raise ValueError(f"action: expected shape ({self.action_size},), got {action.shape}")
-        before = any_arm_state(state)
-        after, distance, runaway = self._moved(before, action)
-        if before.baseline is None:
-            reward = -distance / after.hold
-        else:
-            baseline, own, _ = self._moved(before.baseline, jnp.zeros(self.action_size))
-            after = dataclasses.replace(after, baseline=baseline)
-            reward = relative_reward(distance, own, self._nearest(before), after.hold)
-        steps, done = self._charged_steps(runaway, after.step)
-        metrics = {**state.metrics, "distance": distance, "runaway": runaway.astype(jnp.float32)}
-        after = self.with_plan(after)
-        observation = self.observe(after)
-        return state.replace(pipeline_state=after, obs=observation, reward=steps * reward, done=done, metrics=metrics)
+    def metric_in(self, state: ArmState) -> Metric:
+        """The metric between the expert and the learner in a state."""
+        return self.metric_of(cast(AnyArmState, state).arm)
 
-    def _moved(
-        self, before: AnyArmState, action: Float[Array, " actions"]
-    ) -> tuple[AnyArmState, Float[Array, ""], Bool[Array, ""]]:
-        """The state after a step, without its plan; the distance there; and whether the arm runs away."""
+    def _simulate(
+        self, before: ArmState, command: Float[Array, " numbers"]
+    ) -> tuple[AnyArmState, Float[Array, " joints"]]:
+        before = cast(AnyArmState, before)
+        after = self._moved(before, command)
+        if before.baseline is not None:
+            after = dataclasses.replace(after, baseline=self._moved(before.baseline, jnp.zeros(self.action_size)))
+        return self.with_plan(after), self.command(before, command)
+
+    def _moved(self, before: AnyArmState, action: Float[Array, " actions"]) -> AnyArmState:
+        """The state after a control step of constant torque, without its plan."""
         torque = self.command(before, action)
         qpos, qvel = self._advance(before.arm, before.qpos, before.qvel, torque, Load())
         followed = chosen_goal(before.goals)
-        after = dataclasses.replace(before, qpos=qpos, qvel=qvel, step=before.step + 1, followed=followed)
-        expert = self.expert_at(after.demonstration, after.step)
-        runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # True for NaN too
-        distance = self.metric_of(after.arm)(expert, link_states(after.arm, qpos, qvel))
-        return after, jnp.where(runaway, _RUNAWAY * after.hold, distance), runaway
+        return dataclasses.replace(before, qpos=qpos, qvel=qvel, step=before.step + 1, followed=followed)
+
+    def _runaway_distance(self, state: ArmState) -> Float[Array, ""]:
+        return _RUNAWAY * cast(AnyArmState, state).hold
+
+    def _reward(
+        self, before: ArmState, after: ArmState, distance: Float[Array, ""], excess: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        before, after, other = cast(AnyArmState, before), cast(AnyArmState, after), cast(AnyArmState, after).baseline
+        if other is None:
+            return -distance / after.hold
+        expert = self.expert_at(other.demonstration, other.step)
+        baseline = self.metric_in(other)(expert, link_states(other.arm, other.qpos, other.qvel))
+        baseline = jnp.where(self._is_runaway(other), self._runaway_distance(other), baseline)
+        return relative_reward(distance, baseline, self._nearest(before), after.hold)
 
     def _nearest(self, before: AnyArmState) -> Float[Array, ""]:
         """The distance after the next step of an arm that is exactly in its goal, or in that of the baseline."""

@@ -1,7 +1,5 @@
 """Training wrappers: brax's own, with a new random demonstration for every episode."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State, Wrapper
@@ -18,7 +16,7 @@ class FreshEpisodeWrapper(Wrapper):
     synchronous, each batch would contain only one part of the motion.
     """
 
-    def __init__(self, env: Wrapper, imitation: Any):  # an `ImitationEnv`, or an `AnyArmEnv` of many arms
+    def __init__(self, env: Wrapper, imitation: ImitationEnv):
         super().__init__(env)
         self._imitation = imitation
 
@@ -57,8 +55,8 @@ def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, ran
       ValueError: a `randomization_fn`; see `RandomizationConfig` for randomization.
     """
     imitation = env.unwrapped
-    if not hasattr(imitation, "restart_done"):
-        raise TypeError(f"expected an ImitationEnv or AnyArmEnv, got {type(imitation).__name__}")
+    if not isinstance(imitation, ImitationEnv):
+        raise TypeError(f"expected an ImitationEnv, got {type(imitation).__name__}")
     if randomization_fn is not None:
         raise ValueError("randomization_fn is not supported")
     wrapped = EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.envs.imitation import training_and_held_out
+from mimic.envs.imitation import limit_excess, training_and_held_out
 from mimic.envs.wrappers import fresh_episodes
 from tests.helpers.tiny import SHORT_ARMS
 
@@ -154,11 +154,11 @@ def test_hardware_limits_are_penalised_near_and_beyond_them():
     limited = mimic.make("panda4dof", demonstrations=FEW, limits="hardware", limit_weight=2.0)
     home, still = jnp.asarray(limited.learner.home, jnp.float32), jnp.zeros(4)
     upper, limit = limited.learner.joint_range[:, 1], limited.learner.velocity_limit
-    assert limited.limit_excess(home, still) == 0
-    beyond = limited.limit_excess(home.at[0].set(upper[0] + 0.02), still)
+    assert limit_excess(limited.learner, home, still) == 0
+    beyond = limit_excess(limited.learner, home.at[0].set(upper[0] + 0.02), still)
     assert beyond == pytest.approx(0.5 * (0.02 + 0.03) / 0.1 / 4, rel=1e-3)  # 3e-7 of an angle, over 0.05
-    assert limited.limit_excess(home.at[0].set(upper[0] + 9.0), still) == pytest.approx(0.5 / 4)
-    assert limited.limit_excess(home, still.at[1].set(-1.5 * limit[1])) == pytest.approx(0.5 / 4)
+    assert limit_excess(limited.learner, home.at[0].set(upper[0] + 9.0), still) == pytest.approx(0.5 / 4)
+    assert limit_excess(limited.learner, home, still.at[1].set(-1.5 * limit[1])) == pytest.approx(0.5 / 4)
     for env, weight in ((free, 0.0), (limited, 2.0)):
         state = env.reset(jax.random.PRNGKey(0))
         arm = state.pipeline_state.replace(qvel=still.at[1].set(1.2 * limit[1]))
