@@ -294,13 +294,17 @@ class Evaluator:
             finite = {split: of_split[~np.isnan(of_split)] for split, of_split in values.items()}
             return {split: total(of_split).item() if of_split.size else np.nan for split, of_split in finite.items()}
 
+        gaps_of_many: dict[str, Any] = {}
+        of_one: dict[str, Any] = {}
         if self._arms is None:
-            own: dict[str, Any] = {"by_kind": self._by_kind(table), "effective_rank": self._effective_rank()}
+            of_one = {"by_kind": self._by_kind(table), "effective_rank": self._effective_rank()}
         else:
-            own = {"median_gap": by_split("gap", np.median), "largest_gap": by_split("gap", np.max)}
-            own["controller_gap"] = by_split("controller_gap")
-        columns = [key for key in by_arm if key not in ("gap", "controller_gap", "span")]
-        return {"optimality_gap": by_split("gap"), **own, **{key: by_split(key) for key in columns}}
+            gaps_of_many = {"median_gap": by_split("gap", np.median), "largest_gap": by_split("gap", np.max)}
+            gaps_of_many["controller_gap"] = by_split("controller_gap")
+        distances = {key: by_split(key) for key in ("mean_distance", "lower_bound", "hold_distance")}
+        others = [key for key in by_arm if key not in ("gap", "controller_gap", "span", *distances)]
+        totals = {key: by_split(key) for key in others}
+        return {"optimality_gap": by_split("gap"), **gaps_of_many, **distances, **of_one, **totals}
 
     def _effective_rank(self) -> dict[str, float]:
         demonstrations = self.env.demonstrations
