@@ -21,7 +21,7 @@ from mimic.envs.imitation import ImitationEnv
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.evaluation.labels import ALL_KINDS, SPLITS
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
-from mimic.evaluation.references import CONTROLLER, Motions, references_of_arms, references_of_one_arm
+from mimic.evaluation.references import CONTROLLER, Motions, References, references_of_arms, references_of_one_arm
 from mimic.evaluation.rollout_metrics import (
     WORST,
     Table,
@@ -119,7 +119,12 @@ class Evaluator:
         self.groups = [Group(*names[i], slice(i * count, (i + 1) * count)) for i in range(len(names))]
         stacked = stack_arms([arm for key in (SEEN, UNSEEN) for arm in arms[key].values()]).astype(np.float32)
         self._arms = stacked
-        self._references = Background(lambda: references_of_arms(of_many, stacked, controller()))
+
+        def references() -> References:
+            rollouts = jax.device_get(controller())
+            return references_of_arms(of_many, stacked, rollouts.qpos, rollouts.distance)
+
+        self._references = Background(references)
 
     def on_mjx(self) -> "Evaluator":
         """An evaluator of rollouts on MJX, with the same bound and the same baselines."""

@@ -1,6 +1,6 @@
 """What a rollout is compared with: the kinematic bound, holding the start pose, and motions without learning."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +17,6 @@ from mimic.retargeting import array_bound
 from mimic.retargeting.kinematic_bound import closest_motion
 from mimic.retargeting.pose import shared_joints
 from mimic.retargeting.pose_baselines import baseline_poses
-
-if TYPE_CHECKING:
-    from mimic.evaluation.evaluator import Rollouts
 
 Motions = Float[np.ndarray, "rows time joints"]
 CONTROLLER = "controller"  # the name of the zero action's motions
@@ -84,16 +81,18 @@ def _lower_bound(env: ImitationEnv, qpos: Motions, qvel: Motions) -> tuple[np.nd
         return distance, poses
 
 
-def references_of_arms(env: AnyArmEnv, arms: ArmArrays, controller: "Rollouts") -> References:
+def references_of_arms(
+    env: AnyArmEnv, arms: ArmArrays, qpos: Motions, distance: Float[np.ndarray, "rows time"]
+) -> References:
     """The references of many arms, from one compiled function.
 
     Args:
       env: the environment.
       arms: [arms, ...] each.
-      controller: rollouts of the zero action, from which the search of the bound starts.
+      qpos: the learners' angles under the zero action [rad], from which the search of the bound starts.
+      distance: their distances.
     """
     expert_states, count = _expert_states(env), env.demonstrations.count
-    qpos, distance = (np.asarray(x) for x in (controller.qpos, controller.distance))
 
     def of_arm(inputs: tuple[ArmArrays, Array]) -> tuple[Array, Array, Array]:
         arm, guesses = inputs
