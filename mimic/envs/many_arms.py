@@ -129,6 +129,7 @@ class AnyArmEnv(ImitationEnv):
 
     def start_of(self, arm: ArmArrays, demonstration: Int[Array, ""] | int, key: Array) -> AnyArmState:
         """The first state of an episode of a given arm on a demonstration."""
+        demonstration = jnp.asarray(demonstration, jnp.int32)
         metric, zeros = self.metric_of(arm), jnp.zeros(MAX_JOINTS)
         samples = jnp.linspace(1, self.config.horizon, _HOLD_SAMPLES).astype(jnp.int32)
         at_home = link_states(arm, arm.home)
@@ -137,7 +138,7 @@ class AnyArmEnv(ImitationEnv):
             qpos=arm.home,
             qvel=zeros,
             step=jnp.zeros((), jnp.int32),
-            demonstration=jnp.asarray(demonstration, jnp.int32),
+            demonstration=demonstration,
             key=key,
             arm=arm,
             max_torque=torque_scale(arm, self.config.action_scale, self.config.control_dt),

@@ -219,9 +219,9 @@ class Evaluator:
     def _expert_line(self) -> CentreLine:
         """Centre lines of the expert after each step, for each row."""
         qpos = self.env.demonstrations.qpos[:, 1 : self.env.config.horizon + 1].astype(np.float32)
-        line = centre_line_table(self.env.embodiments[0], qpos)
         if self._arms is None:
-            return line
+            return centre_line_table(self.env.embodiments[0], qpos)
+        line = centre_line_table(self.env.expert, qpos)
         return jax.tree.map(lambda x: np.tile(x, (len(self.groups), *[1] * (x.ndim - 1))), line)
 
     def similarity(self, qpos: Motions) -> Table:

@@ -33,17 +33,17 @@ def unused() -> Any:
 
 def rollouts(distance: Any) -> Rollouts:
     """Rollouts at rest in the zero pose of constant distance, a number for each arm."""
-    by_row = np.repeat(np.asarray(distance, np.float32), HELD_OUT)[:, None]
-    still = np.zeros((len(by_row), HORIZON, MAX_JOINTS), np.float32)
-    return Rollouts(still, still, still, np.broadcast_to(by_row, (len(by_row), HORIZON)))
+    by_row: Any = np.repeat(np.asarray(distance, np.float32), HELD_OUT)[:, None]
+    still: Any = np.zeros((len(by_row), HORIZON, MAX_JOINTS), np.float32)
+    return Rollouts(still, still, still, np.tile(by_row, (1, HORIZON)))
 
 
 def evaluator_of(env, monkeypatch, bound, *, arms=None):
     """With these bounds of the arms, and a distance of holding of 1."""
     evaluator = Evaluator(env, env.held_out, arms or report_arms(env.config), unused)
-    controller = rollouts([0.28] * 7 + [0.9])
+    controller: Any = rollouts([0.28] * 7 + [0.9])
     bounds = np.minimum(rollouts(bound).distance, controller.distance)
-    motions = dict.fromkeys((CONTROLLER, "nearest_poses", "hold_home"), controller.qpos)
+    motions: Any = dict.fromkeys((CONTROLLER, "nearest_poses", "hold_home"), controller.qpos)
     references = References(bounds, np.ones_like(bounds), motions, controller.distance)
     monkeypatch.setattr(evaluator, "_references", lambda: references)
     return evaluator
