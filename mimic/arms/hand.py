@@ -20,6 +20,7 @@ _CAPSULE, _CYLINDER, _MESH = (
     int(kind) for kind in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_MESH)
 )
 _AT_JOINT = 1e-6  # m
+_NO_NAME = "no name tells where the tool is"
 _APART = 0.005  # m; candidates for the origin that are farther apart leave a doubt
 
 
@@ -174,11 +175,11 @@ def _farthest(model: mujoco.MjModel, data: mujoco.MjData, joint: int, frames: It
     others = [frame for frame in frames if not is_sensor(frame.name) and distance(frame.point, anchor) > _AT_JOINT]
     if others:
         farthest = max(others, key=lambda frame: distance(frame.point, anchor))
-        return _Origin(farthest.point, [], f"{farthest}, the farthest frame of the last link")
+        return _Origin(farthest.point, [], f"{farthest}, the farthest frame of the last link", _NO_NAME)
     shapes = max(_shape_ends(model, data, last), key=lambda point: distance(point, anchor), default=anchor)
     if distance(shapes, anchor) > _AT_JOINT:
-        return _Origin(shapes, [], "the farthest end of the shapes of the last link")
-    return _Origin(anchor, [], f"joint {model.joint(joint).name!r}, as no frame is fixed to the last link")
+        return _Origin(shapes, [], "the farthest end of the shapes of the last link", _NO_NAME)
+    return _Origin(anchor, [], f"joint {model.joint(joint).name!r}, as no frame is fixed to the last link", _NO_NAME)
 
 
 def _shape_ends(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Iterator[np.ndarray]:

@@ -79,7 +79,8 @@ def find_axes(point: np.ndarray, wrist: Wrist, frames: Sequence[Frame] = (), gri
         doubt = doubt or _other_opening(x, z, frames)
     if x is None:
         x, x_reason = _opening_by_joints(z, wrist)
-        doubt = "; ".join(filter(None, (doubt, "nothing tells how a gripper would open")))
+        unknown = "nothing tells how a gripper would open" if wrist.previous is not None else ""  # an arm in a plane
+        doubt = "; ".join(filter(None, (doubt, unknown)))
     x = x - (x @ z) * z
     x = x / np.linalg.norm(x)
     return Axes(np.stack([x, np.cross(z, x), z], axis=1), f"approach by {z_reason}, opening by {x_reason}", doubt)

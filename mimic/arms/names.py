@@ -7,7 +7,7 @@ _WORD = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+")
 # Frames at the working point or the mount of a tool, the most telling first: each is a set of words.
 _TOOLS = (
     {"tcp"}, {"pinch"}, {"grip"}, {"grasp"}, {"grasping"}, {"ee"}, {"eef"}, {"eff"}, {"endeffector"}, {"effector"},
-    {"gripper", "frame"}, {"gripper", "center"}, {"tool"}, {"attachment"}, {"flange"},
+    {"gripper", "frame"}, {"gripperframe"}, {"gripper", "center"}, {"tool"}, {"attachment"}, {"flange"},
 )  # fmt: skip
 _HANDS = ({"tip"}, {"hand"}, {"palm"}, {"gripper"}, {"end"})  # frames of a hand, which may be where it begins
 _SENSORS = {

@@ -84,7 +84,7 @@ class ArmScene:
         self._camera.distance = (1.4 + 0.7 * (len(arms) - 1) + 1.6 * is_flat) * reach + 0.5 * highest
         self._camera.azimuth, self._camera.elevation = (0.0, -89.0) if is_flat else (165.0, -14.0)
         self._aspect, self._centres = width / height, [0.0] * len(arms)
-        self._renderer = _renderer(self._model, width, height, fast)
+        self._renderer = new_renderer(self._model, width, height, fast)
 
     def fit(self, poses: Sequence[Float[np.ndarray, "frames joints"]]) -> None:
         """Moves arms and camera so that the arms fill the image in all these poses [rad], those of each arm in turn.
@@ -238,7 +238,8 @@ def _mark_locked(spec: mujoco.MjSpec, joint_name: str, chain_length: float) -> N
     )  # fmt: skip
 
 
-def _renderer(model: mujoco.MjModel, width: int, height: int, fast: bool) -> mujoco.Renderer:
+def new_renderer(model: mujoco.MjModel, width: int, height: int, fast: bool = False) -> mujoco.Renderer:
+    """A renderer of images, see `ArmScene`; with EGL where there is no display."""
     try:
         is_plain = fast and is_software_renderer()
         if is_plain:

@@ -37,6 +37,7 @@ def visual_spec(
       ValueError: what `arm_spec` and `find_chain` reject.
     """
     spec = arm_spec(config)
+    spec.compiler.discardvisual = False  # hands and marks are visual, which MuJoCo discards in a URDF
     for number, body in enumerate(spec.bodies):  # links are found by the names of their bodies
         body.name = body.name or f"unnamed body {number}"
     model = spec.compile()

@@ -102,7 +102,7 @@ def test_a_wrist_that_pitches_approaches_along_its_link(content, opening):
             "the opening by site 'ee' is",
         ),
         (SLIDES, "no frame marks the tips of the fingers"),
-        ("", "nothing tells how a gripper would open"),
+        ("", "no name tells where the tool is; nothing tells how a gripper would open"),
     ],
 )
 def test_doubts(content, doubt):
@@ -154,6 +154,8 @@ def test_a_urdf_has_the_hand_of_its_mjcf(tmp_path):
     urdf, mjcf = load_mjcf(file), load_mjcf(mujoco.MjModel.from_xml_string(arm(SLIDES + frame("x_tool", "0.13 0 0"))))
     np.testing.assert_allclose(urdf.hand_position, mjcf.hand_position, atol=1e-12)
     np.testing.assert_allclose(urdf.hand_rotation, mjcf.hand_rotation, atol=1e-12)
+    drawn = visual_spec(ArmConfig(model=str(file)))[0].compile()
+    assert mujoco.mj_name2id(drawn, mujoco.mjtObj.mjOBJ_GEOM, f"{HAND_LINE}0 x") >= 0
 
 
 # --- the user's choice ------------------------------------------------------------------------------------------------
