@@ -147,7 +147,8 @@ def _named_or_between_fingers(
         told = list(filter(None, (best_frame(tools, tool_rank, anchor) or hand,)))
         return _Origin(gripper.middle, told, f"between {', '.join(str(x.frame) for x in fingers)}", doubt)
     if hand:
-        return _Origin(hand.point, [hand], f"{hand}, named as hands are")
+        doubt = f"{fingers[0].frame} is distal of it" if fingers else ""
+        return _Origin(hand.point, [hand], f"{hand}, named as hands are", doubt)
     return _Origin(fingers[0].frame.point, [], f"{fingers[0].frame}, a finger") if fingers else None
 
 

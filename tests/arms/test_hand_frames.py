@@ -101,6 +101,7 @@ def test_a_wrist_that_pitches_approaches_along_its_link(content, opening):
             frame("tcp", "0.1 0 0", f"{TO_X}") + frame("ee", "0.1 0 0", 'euler="0.785 0 0"'),
             "the opening by site 'ee' is",
         ),
+        (JAW + frame("gripper_stator", "0.01 0 0"), "body 'moving_jaw' is distal of it"),
         (SLIDES, "no frame marks the tips of the fingers"),
         ("", "no name tells where the tool is; nothing tells how a gripper would open"),
     ],
