@@ -128,7 +128,7 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
     )
     evaluated = dataclasses.replace(trained, env=env)
     unseen = _unseen(config, env)
-    shared = make_ppo_trainer(trained, run_dir).shared_policy() if config.learner else None
+    shared = make_ppo_trainer(trained, run_dir) if config.learner else None
     trainer = make_ppo_trainer(evaluated, run_dir, unseen, shared)
     return dataclasses.replace(evaluated, env=trainer.env_config), trainer
 

@@ -394,8 +394,10 @@ def limit_excess(
 def where_done(done: Float[Array, " batch"], new: Any, old: Any) -> Any:
     """The new values of the samples of a batch whose episode is done, and the old ones of the others."""
 
+    is_done = done.astype(bool)
+
     def choose(new: Array, old: Array) -> Array:
-        return jnp.where(done.astype(bool).reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
+        return jnp.where(is_done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
 
     return jax.tree.map(choose, new, old)
 

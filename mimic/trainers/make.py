@@ -14,7 +14,7 @@ from mimic.trainers.fine_tuning import with_one_learner
 from mimic.trainers.trainer import Trainer
 
 if TYPE_CHECKING:
-    from mimic.trainers.ppo.trainer import PolicyOfManyArms, PPOTrainer
+    from mimic.trainers.ppo.trainer import PPOTrainer
 
 
 def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
@@ -39,7 +39,7 @@ def make_ppo_trainer(
     config: TrainConfig,
     run_dir: Path | None,
     unseen: Demonstrations | None = None,
-    shared: "PolicyOfManyArms | None" = None,
+    shared: "PPOTrainer | None" = None,
 ) -> "PPOTrainer":
     """The trainer of a config with trainer=ppo; see `PPOTrainer`."""
     compat.import_mjx()
@@ -71,8 +71,7 @@ def make_policy_trainer(
             f"learner: expected one arm for a run of many, env={config.env.name}, as in learner=panda locked=[2,4]"
         )
     of_one = dataclasses.replace(config, env=with_one_learner(config.env, learner, locked))
-    shared = make_ppo_trainer(config, run_dir).shared_policy()
-    return of_one, make_ppo_trainer(of_one, run_dir, shared=shared)
+    return of_one, make_ppo_trainer(of_one, run_dir, shared=make_ppo_trainer(config, run_dir))
 
 
 def _make_pose_mapper_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:

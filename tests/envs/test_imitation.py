@@ -149,6 +149,12 @@ def test_a_runaway_ends_the_episode_and_never_pays(planar_env):
     assert after.reward == pytest.approx(worst_rest, rel=1e-5)
 
 
+def test_an_action_of_another_length_is_rejected(planar_env):
+    state = jax.eval_shape(planar_env.reset, jax.random.PRNGKey(0))
+    with pytest.raises(ValueError, match=r"action: expected shape \(2,\), got \(3,\)"):
+        jax.eval_shape(planar_env.step, state, jnp.zeros(3))
+
+
 def test_hardware_limits_are_penalised_near_and_beyond_them():
     free = mimic.make("panda4dof", demonstrations=FEW)
     limited = mimic.make("panda4dof", demonstrations=FEW, limits="hardware", limit_weight=2.0)

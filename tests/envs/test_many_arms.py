@@ -236,16 +236,6 @@ def test_a_policy_moves_one_arm_as_it_moves_it_among_many(env, evaluator, four_j
     np.testing.assert_allclose(of_many[:, :, [0, 1, 3, 4]], np.asarray(alone.qpos)[:COUNT], rtol=0, atol=1e-3)
 
 
-def test_an_action_of_another_length_is_rejected(env, four_joints, monkeypatch):
-    monkeypatch.setattr(AnyArmEnv, "_planned", lambda env, state: state)
-
-    def step(key):
-        return env.step(env.begin(env.start_of(four_joints, 0, key)), jnp.zeros(MAX_JOINTS - 1))
-
-    with pytest.raises(ValueError, match=r"action: expected shape \(8,\), got \(7,\)"):
-        jax.eval_shape(step, jax.random.PRNGKey(0))
-
-
 @pytest.mark.slow
 def test_arms_that_are_not_done_go_on_as_without_a_restart(env, zero_actions):
     """Training restarts in each step the arms that are done; the others must be those of an evaluation."""

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,18 +29,6 @@ EVALUATED_DEMONSTRATIONS = 8  # of the held-out ones, by each of many arms: with
 _VALIDATION = 64  # training demonstrations by which a fine-tuning chooses its result: one arm, so they cost little
 
 
-class PolicyOfManyArms(NamedTuple):
-    """A policy that was trained on many arms, to evaluate on one.
-
-    Attributes:
-      params_template: makes the parameters, or their shapes, with the structure of a checkpoint.
-      controller: from the environment of the arm and parameters to the controller of that arm.
-    """
-
-    params_template: Callable[[], Params]
-    controller: Callable[[ImitationEnv, Params], ControllerWithMemory]
-
-
 class PPOTrainer(Trainer):
     """Trains a policy on the training demonstrations, and evaluates it on these and on held-out ones.
 
@@ -52,7 +40,7 @@ class PPOTrainer(Trainer):
       config: the run's config.
       run_dir: directory of an existing run, whose demonstrations are used.
       unseen: demonstrations to evaluate on instead of the held-out ones.
-      shared: the policy, where it was trained on many arms and is evaluated on one; it cannot be trained.
+      shared: trainer of many arms, whose policy is evaluated on the one of the config; it cannot be trained there.
 
     Attributes:
       evaluator: evaluates controllers on the run's demonstrations.
@@ -68,7 +56,7 @@ class PPOTrainer(Trainer):
         config: TrainConfig,
         run_dir: Path | None,
         unseen: Demonstrations | None = None,
-        shared: PolicyOfManyArms | None = None,
+        shared: "PPOTrainer | None" = None,
     ):
         assert isinstance(config.trainer, PPOConfig)
         self._name, self._seed, self._shared = config.env.name, config.seed, shared
@@ -128,7 +116,7 @@ class PPOTrainer(Trainer):
     def controller(self, params: Params) -> Controller | ControllerWithMemory:
         """The deterministic policy of these parameters."""
         if self._shared is not None:
-            return self._shared.controller(self.evaluator.env, params)
+            return nearest_pose_controller(self.evaluator.env, self._shared._policy(params))
         return ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)(params)
 
     def policy(self, params: Params) -> Callable[[Any], Any]:
@@ -138,14 +126,6 @@ class PPOTrainer(Trainer):
     def _policy(self, params: Params) -> Callable[[Any], Any]:
         controller = self.controller(params)
         return lambda observation: controller(SimpleNamespace(obs=observation))  # type: ignore[arg-type]
-
-    def shared_policy(self) -> PolicyOfManyArms:
-        """The policy of many arms, to evaluate it on one."""
-
-        def controller(env: ImitationEnv, params: Params) -> ControllerWithMemory:
-            return nearest_pose_controller(env, self._policy(params))
-
-        return PolicyOfManyArms(self.params_template, controller)
 
     def _compile(self) -> Callable[[Params], Rollouts]:
         demonstrations = None
