@@ -13,7 +13,6 @@ and damping, and random arms of `random_arm`.
 
 import argparse
 import time
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,16 +21,15 @@ import numpy as np
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, lock_joints, stack_arms
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, lock_joints
 from mimic.arms.named_arms import named_arms
 from mimic.arms.sampler import lock_masks, lock_sampler, random_arm
 from mimic.envs import env_config
+from mimic.envs.family import SEEN, UNSEEN
 from mimic.envs.imitation import training_and_held_out
 from mimic.envs.many_arms import AnyArmEnv
+from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.rollout_metrics import MIN_SPAN
-from mimic.metric.kinematics import link_states
-from mimic.metric.similarity import centre_line, similarity
-from mimic.retargeting.array_bound import closest_motion
 
 REAL = ("ur5e", "ur10e", "iiwa", "iiwa14", "kinova3", "gen3", "sawyer", "jaco", "xarm7", "fetch")
 KINDS = ("presets", "locks", "real", "random")
@@ -60,48 +58,34 @@ def make_arms(kind: str, count: int) -> dict[str, ArmArrays]:
     return {"+".join(map(str, np.flatnonzero(mask) + 1)): lock_joints(panda, mask) for mask in masks}
 
 
-def run_arm(env: AnyArmEnv, expert: ArmArrays, arm: ArmArrays) -> dict[str, jax.Array]:
-    """Distances and measures of similarity at each step, [demonstrations, time], by name."""
-    horizon = env.config.horizon
-
-    def of_demonstration(index: jax.Array, expert_qpos: jax.Array) -> dict[str, jax.Array]:
-        start = env.begin(env.start_of(arm, index, jax.random.PRNGKey(0)))
-
-        def step(state: Any, _: None) -> tuple[Any, tuple[jax.Array, jax.Array]]:
-            state = env.step(state, jnp.zeros(env.action_size))
-            return state, (state.metrics["distance"], state.pipeline_state.qpos)
-
-        _, (distance, qpos) = jax.lax.scan(step, start, None, length=horizon)
-        states = jax.vmap(lambda time: env.expert_at(index, time))(jnp.arange(1, horizon + 1))
-        metric, at_home = env.metric_of(arm), link_states(arm, arm.home)
-        closest = closest_motion(arm, metric, states, qpos)
-        home = jnp.broadcast_to(arm.home, qpos.shape)
-        poses = {"": qpos, "best_": closest.qpos, "hold_": home}
-        line = centre_line(expert, expert_qpos)
-        measures = {prefix: similarity(line, centre_line(arm, motion)) for prefix, motion in poses.items()}
-        return {
-            "distance": distance,
-            # A controller below the bound has found a minimum that the search missed.
-            "bound": jnp.minimum(closest.distance, distance),
-            "hold": jax.vmap(lambda state: metric(state, at_home))(states),
-            **{prefix + name: values for prefix, each in measures.items() for name, values in each.items()},
+def rows_of(env: AnyArmEnv, arms: dict[str, ArmArrays]) -> list[Row]:
+    """The metrics of the zero action of each arm."""
+    evaluator = Evaluator(env, env.demonstrations, {SEEN: arms, UNSEEN: {}}, lambda: rollouts)
+    still = jnp.zeros(env.action_size)
+    rollouts = jax.device_get(jax.jit(lambda: evaluator.rollout(lambda state: still))())
+    details, home = evaluator.details(rollouts), np.stack([np.asarray(arm.home) for arm in arms.values()])
+    held = np.repeat(home, env.demonstrations.count, axis=0)[:, None]
+    motions = {"": rollouts.qpos, "best_": evaluator.nearest_poses, "hold_": np.broadcast_to(held, rollouts.qpos.shape)}
+    similar = {prefix: evaluator.similarity(qpos) for prefix, qpos in motions.items()}
+    # A controller below the bound has found a minimum that the search missed; the references have it.
+    curves = rollouts.distance, evaluator.lower_bound, evaluator.hold_distance
+    late = slice(rollouts.distance.shape[1] // 2, None)
+    result = []
+    for _, name, rows in evaluator.groups:
+        own, means = details[name], [curve[rows].mean(dtype=float) for curve in curves]
+        distance, bound, hold = (curve[rows, late].mean(dtype=float) for curve in curves)
+        measures = {
+            prefix + key: float(values[rows].mean())
+            for prefix, table in similar.items()
+            for key, values in table.items()
         }
-
-    qpos = env.demonstrations.qpos[:, 1 : horizon + 1]
-    padding = [(0, 0), (0, 0), (0, MAX_JOINTS - qpos.shape[-1])]
-    return jax.vmap(of_demonstration)(jnp.arange(len(qpos)), jnp.asarray(np.pad(qpos, padding), jnp.float32))
-
-
-def row(name: str, arm: ArmArrays, outcome: dict[str, np.ndarray]) -> Row:
-    """The metrics of an arm."""
-    half = outcome["distance"].shape[1] // 2
-    gaps = []
-    for start in (0, half):
-        distance, bound, hold = (outcome[key][:, start:].mean() for key in ("distance", "bound", "hold"))
-        gaps.append((distance - bound) / max(hold - bound, 1e-9))
-    means = {key: float(values.mean()) for key, values in outcome.items()}
-    joints, span = int(np.asarray(arm.is_free).sum()), 1 - means["bound"] / means["hold"]
-    return {"arm": name, "joints": joints, "gap": gaps[0], "late": gaps[1], "span": span, **means}
+        gaps = [(x - low) / max(high - low, 1e-9) for x, low, high in (means, (distance, bound, hold))]
+        result.append(
+            {"arm": name, "joints": own["joints"], "gap": gaps[0], "late": gaps[1], "span": own["span"]}
+            | {key: float(mean) for key, mean in zip(("distance", "bound", "hold"), means, strict=True)}
+            | measures
+        )
+    return result
 
 
 def main() -> None:
@@ -111,21 +95,14 @@ def main() -> None:
     held_out = training_and_held_out(config)[1].select(slice(0, options.demonstrations))
     panda = arm_arrays(build_arm(ArmConfig()))
     env = AnyArmEnv(config, held_out, lock_sampler(panda, lock_masks(MAX_JOINTS - 1, 1)))
-    expert = jax.tree.map(jnp.asarray, panda.astype(np.float32))
-    run = jax.jit(lambda arms: jax.lax.map(lambda arm: run_arm(env, expert, arm), arms))
     results: dict[str, list[Row]] = {}
     for kind in options.arms:
         arms = make_arms(kind, options.random)
         if not arms:
             continue
-        batch = jax.tree.map(jnp.asarray, stack_arms(list(arms.values())).astype(np.float32))
         began = time.perf_counter()
-        outcome = {key: np.asarray(values, float) for key, values in run(batch).items()}
+        rows = rows_of(env, arms)
         print(f"{kind}: {len(arms)} arms in {time.perf_counter() - began:.0f} s with compilation")
-        rows = [
-            row(name, arm, {key: values[i] for key, values in outcome.items()})
-            for i, (name, arm) in enumerate(arms.items())
-        ]
         results[kind] = rows
         print_table(rows, COLUMNS, title=kind)
         gaps = np.array([each["gap"] for each in rows if each["span"] >= MIN_SPAN])
