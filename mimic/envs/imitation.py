@@ -393,7 +393,6 @@ def limit_excess(
 
 def where_done(done: Float[Array, " batch"], new: Any, old: Any) -> Any:
     """The new values of the samples of a batch whose episode is done, and the old ones of the others."""
-
     is_done = done.astype(bool)
 
     def choose(new: Array, old: Array) -> Array:
