@@ -50,6 +50,7 @@ from .motions.demonstrations import check_effort as check_effort
 from .motions.demonstrations import load_demonstrations as load_demonstrations
 from .motions.importing import import_demonstrations as import_demonstrations
 from .motions.recording import record_demonstrations as record_demonstrations
+from .retargeting.base_placement import find_base as find_base
 from .retargeting.costs import Costs as Costs
 from .retargeting.kinematic_bound import ClosestMotion as ClosestMotion
 from .retargeting.kinematic_bound import closest_motion as closest_motion

@@ -80,6 +80,9 @@ class Costs:
             raise ValueError("capsules: costs.self_collision and costs.floor need them, as from fit_capsules(config)")
 
 
+NO_COSTS = Costs()
+
+
 def pose_cost(
     costs: Costs,
     expert: Embodiment,

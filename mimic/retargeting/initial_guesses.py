@@ -19,6 +19,8 @@ from mimic.retargeting.pose_objective import PoseObjective, Target
 _POSES = 256  # random poses whose distances are compared to choose the initial guesses
 _TYPICAL_POSES = 16  # at least; of these, whose mean distance is the scale of the metric
 
+_Shape = tuple[int, int, int]  # sets, poses, joints
+
 
 class RandomPoses(NamedTuple):
     """Random poses of the learner, candidates for initial guesses.
@@ -32,7 +34,9 @@ class RandomPoses(NamedTuple):
     states: LinkStates
 
 
-def random_poses(arm: Embodiment | ArmArrays, key: Array | None, sets: int, dtype: Any) -> RandomPoses:
+def random_poses(
+    arm: Embodiment | ArmArrays, key: Array | None, sets: int, dtype: Any, in_set: int | None = None
+) -> RandomPoses:
     """Sets of random poses, uniform in the joint ranges; computed once for equal arguments.
 
     Args:
@@ -40,23 +44,23 @@ def random_poses(arm: Embodiment | ArmArrays, key: Array | None, sets: int, dtyp
       key: `jax.random.key(0)` where None.
       sets: number of sets.
       dtype: of the result.
+      in_set: number of poses in each set; where None, 256 in all sets.
     """
+    shape = sets, in_set or -(-_POSES // sets), arm.num_joints
     if has_tracer((arm, key)):
-        return _traced_poses(arm, key, sets, dtype)
-    return _constant_poses(arm, key, sets, jnp.dtype(dtype))
+        return _traced_poses(arm, key, shape, dtype)
+    return _constant_poses(arm, key, shape, jnp.dtype(dtype))
 
 
-def _traced_poses(arm: Embodiment | ArmArrays, key: Array | None, sets: int, dtype: Any) -> RandomPoses:
-    qpos = _uniform(_shape(arm, sets), key, *_range(arm, dtype))
+def _traced_poses(arm: Embodiment | ArmArrays, key: Array | None, shape: _Shape, dtype: Any) -> RandomPoses:
+    qpos = _uniform(shape, key, *_range(arm, dtype))
     return RandomPoses(qpos, jax.vmap(jax.vmap(lambda q: link_states(arm, q)))(qpos))
 
 
 @by_value
-def _constant_poses(arm: Embodiment | ArmArrays, key: Array | None, sets: int, dtype: Any) -> RandomPoses:
+def _constant_poses(arm: Embodiment | ArmArrays, key: Array | None, shape: _Shape, dtype: Any) -> RandomPoses:
     """By NumPy, because the kinematics would take half a second to compile."""
-    uniform = _compiled_uniform(
-        _shape(arm, sets), None if key is None else jax.ShapeDtypeStruct(key.shape, key.dtype), dtype
-    )
+    uniform = _compiled_uniform(shape, None if key is None else jax.ShapeDtypeStruct(key.shape, key.dtype), dtype)
     with jax.ensure_compile_time_eval():
         qpos = np.asarray(uniform(key, *_range(arm, dtype)))
         if isinstance(arm, ArmArrays):
@@ -79,10 +83,6 @@ def _compiled_uniform(shape: tuple[int, ...], key: jax.ShapeDtypeStruct | None, 
 def _uniform(shape: tuple[int, ...], key: Array | None, lower: Any, upper: Any) -> Array:
     key = jax.random.key(0) if key is None else key
     return jax.random.uniform(key, shape, lower.dtype, minval=lower, maxval=upper)
-
-
-def _shape(arm: Embodiment | ArmArrays, sets: int) -> tuple[int, int, int]:
-    return sets, -(-_POSES // sets), arm.num_joints
 
 
 def _range(arm: Embodiment | ArmArrays, dtype: Any) -> tuple[Any, Any]:

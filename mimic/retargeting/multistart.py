@@ -13,10 +13,10 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mimic.base import compat
-from mimic.retargeting.closed_form import ROUGH_SMOOTHING, SMOOTHING, Smoothing
+from mimic.retargeting.closed_form import ROUGH_SMOOTHING, SMOOTHING
 from mimic.retargeting.optimizers import (
     Derivatives,
     Limits,
@@ -61,19 +61,44 @@ def best_descent(
       descents: settings. The `kept` best descents continue after the rough iterations. None continues all, with the
         exact objective only.
     """
-    exact = functools.partial(objective, smoothing=SMOOTHING)
+    exact, rough = (functools.partial(objective, smoothing=smoothing) for smoothing in (SMOOTHING, ROUGH_SMOOTHING))
     descend = newton if descents.method == "newton" else gradient_descent
-    kept = None if descents.kept is None else min(descents.kept, len(guesses))
-    if kept is None:
+    if descents.kept is None:
         ends = descend(exact, guesses.swapaxes(0, 1), limits, descents.iterations)
-    elif descents.method == "newton" and compat.is_cpu():
-        ends = _descend_in_one_loop(objective, guesses, limits, descents._replace(kept=kept))
+    elif descents.method == "newton":
+        ends = kept_descents(objective, guesses, limits, descents)
     else:
-        rough = functools.partial(objective, smoothing=ROUGH_SMOOTHING)
         ends = descend(rough, guesses.swapaxes(0, 1), limits, descents.rough_iterations)
-        best = _best_lanes(ends, kept)
+        best = _best_lanes(ends, min(descents.kept, len(guesses)))
         ends = descend(exact, best.qpos, limits, descents.iterations - descents.rough_iterations)
     return jax.tree.map(lambda x: x[..., 0, :], _best_lanes(ends, 1))
+
+
+def kept_descents(
+    objective: SmoothedObjective,
+    guesses: Float[Array, "guesses joints poses"],
+    limits: Limits,
+    descents: Descents,
+    settings: tuple[Any, Any] = (ROUGH_SMOOTHING, SMOOTHING),
+    apart: float = 0.0,
+) -> Solution:
+    """The ends [kept, poses] of the descents that are kept, by Newton's method.
+
+    Args:
+      objective: of joint angles [lanes, poses] each.
+      guesses: [rad].
+      limits: of the joints [rad].
+      descents: settings.
+      settings: the argument `smoothing` of the objective, in the rough iterations and in the others.
+      apart: of poses that differ less, the maximum over the joints [rad], only the best one is kept.
+    """
+    kept = min(descents.kept or len(guesses), len(guesses))
+    if compat.is_cpu():
+        return _descend_in_one_loop(objective, guesses, limits, descents._replace(kept=kept), settings, apart)
+    rough, last = (functools.partial(objective, smoothing=setting) for setting in settings)
+    ends = newton(rough, guesses.swapaxes(0, 1), limits, descents.rough_iterations)
+    best = _best_lanes(ends, kept, apart)
+    return newton(last, best.qpos, limits, descents.iterations - descents.rough_iterations)
 
 
 class _Step(NamedTuple):
@@ -83,16 +108,16 @@ class _Step(NamedTuple):
       begins: whether a descent begins.
       is_last: whether it is the last descent, from the best results of the others.
       round: number of the descent of each lane, as an index of the guesses.
-      smoothing: of the objective.
+      smoothing: of the objective, or other settings.
     """
 
     begins: Any
     is_last: Any
     round: Any
-    smoothing: Smoothing
+    smoothing: Any
 
 
-def _schedule(rounds: int, descents: Descents, dtype: Any) -> _Step:
+def _schedule(rounds: int, descents: Descents, settings: tuple[Any, Any], dtype: Any) -> _Step:
     """Steps of all descents in order; one more than iterations in each, which evaluates its start."""
     lengths = [descents.rough_iterations + 1] * rounds + [descents.iterations - descents.rough_iterations + 1]
     round_of_step = np.repeat(np.arange(rounds + 1), lengths)
@@ -101,12 +126,17 @@ def _schedule(rounds: int, descents: Descents, dtype: Any) -> _Step:
         begins=np.concatenate([np.arange(length) == 0 for length in lengths]),
         is_last=is_last,
         round=np.minimum(round_of_step, rounds - 1),
-        smoothing=jax.tree.map(lambda *x: np.where(is_last, *x).astype(dtype), SMOOTHING, ROUGH_SMOOTHING),
+        smoothing=jax.tree.map(lambda rough, last: np.where(is_last, last, rough).astype(dtype), *settings),
     )
 
 
 def _descend_in_one_loop(
-    objective: SmoothedObjective, guesses: Float[Array, "guesses joints poses"], limits: Limits, descents: Descents
+    objective: SmoothedObjective,
+    guesses: Float[Array, "guesses joints poses"],
+    limits: Limits,
+    descents: Descents,
+    settings: tuple[Any, Any],
+    apart: float,
 ) -> Solution:
     kept = descents.kept or len(guesses)
     rounds = _rounds(guesses, kept)
@@ -117,7 +147,7 @@ def _descend_in_one_loop(
         state, best = carry
         ends = solution_at(state, limits)
         ends = ends._replace(value=jnp.where(step.is_last & is_repeated, jnp.inf, ends.value))
-        best = _best_lanes(jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), best, ends), kept)
+        best = _best_lanes(jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), best, ends), kept, apart)
         guess = jax.lax.dynamic_index_in_dim(rounds, step.round, keepdims=False)
         return newton_start(jnp.where(step.is_last, best.qpos, guess), limits), best
 
@@ -130,7 +160,7 @@ def _descend_in_one_loop(
         return (newton_step(of_step, state, limits, index), best), None
 
     unknown = newton_start(rounds[0], limits)
-    steps = jax.tree.map(jnp.asarray, _schedule(len(rounds), descents, rounds.dtype))
+    steps = jax.tree.map(jnp.asarray, _schedule(len(rounds), descents, settings, rounds.dtype))
     indices = jnp.arange(len(steps.begins))
     (state, _), _ = jax.lax.scan(iterate, (unknown, solution_at(unknown, limits)), (indices, steps))
     return solution_at(state, limits)
@@ -143,11 +173,25 @@ def _rounds(guesses: Float[Array, "guesses joints poses"], kept: int) -> Float[A
     return guesses.reshape(-1, kept, *guesses.shape[1:]).swapaxes(1, 2)
 
 
-def _best_lanes(ends: Solution, kept: int) -> Solution:
+def _best_lanes(ends: Solution, kept: int, apart: float = 0.0) -> Solution:
     """The best of the lanes [joints, lanes, poses] of each pose."""
     if ends.value.shape[0] == kept:
         return ends
+    if apart:
+        ends = ends._replace(value=jnp.where(_repeats(ends, apart), jnp.inf, ends.value))
     index = jax.lax.top_k(-ends.value.T, kept)[1].T
     return jax.tree.map(
         lambda x: jnp.take_along_axis(x, jnp.broadcast_to(index, (*x.shape[:-2], *index.shape)), axis=-2), ends
     )
+
+
+def _repeats(ends: Solution, apart: float) -> Bool[Array, "lanes poses"]:
+    """Whether a better lane has nearly the same pose."""
+    lanes, differs = len(ends.value), False
+    for angle in ends.qpos:  # differences of angles, up to full revolutions
+        differs = differs | (jnp.cos(angle[:, None] - angle[None]) < np.cos(apart))
+    order = jnp.arange(lanes)[:, None, None]
+    better = (ends.value[None] < ends.value[:, None]) | (
+        (ends.value[None] == ends.value[:, None]) & (order > order.swapaxes(0, 1))
+    )
+    return jnp.any(better & ~differs, axis=1)

@@ -79,22 +79,28 @@ class NewtonState(NamedTuple):
     damping: Scalar
 
 
-def newton(objective: Objective, start: Float[Array, "joints *lanes"], limits: Limits, iterations: int) -> Solution:
+def newton(
+    objective: Objective,
+    start: Float[Array, "joints *lanes"],
+    limits: Limits,
+    iterations: int,
+    damping: Scalar = _FIRST_DAMPING,
+) -> Solution:
     """Damped Newton descent with the exact second derivative and negative curvature flipped (saddle-free Newton)."""
 
     def iterate(state: NewtonState, index: Array) -> tuple[NewtonState, None]:
         return newton_step(objective, state, limits, index), None
 
-    state, _ = jax.lax.scan(iterate, newton_start(start, limits), jnp.arange(iterations + 1))
+    state, _ = jax.lax.scan(iterate, newton_start(start, limits, damping), jnp.arange(iterations + 1))
     return solution_at(state, limits)
 
 
-def newton_start(start: Float[Array, "joints *lanes"], limits: Limits) -> NewtonState:
+def newton_start(start: Float[Array, "joints *lanes"], limits: Limits, damping: Scalar = _FIRST_DAMPING) -> NewtonState:
     """The state before the first step, which is zero and evaluates the start, whose value is below infinity."""
     joints = start.shape[0]
     zero = jnp.zeros_like(start[0])
     unevaluated = Derivatives(zero + jnp.inf, (zero,) * joints, tuple((zero,) * (k + 1) for k in range(joints)))
-    return NewtonState(_within(list(start), _bounds(limits, joints)), unevaluated, zero + _FIRST_DAMPING / _LESS)
+    return NewtonState(_within(list(start), _bounds(limits, joints)), unevaluated, zero + damping / _LESS)
 
 
 def newton_step(objective: Objective, state: NewtonState, limits: Limits, index: Any) -> NewtonState:

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,16 +21,20 @@ from mimic.base.spatial import array_library
 from mimic.metric.distance import Correspondence, DistanceWeights, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.hand import NO_HAND, HandWeights
 from mimic.metric.kinematics import resting_link_states
-from mimic.retargeting.costs import Costs, with_costs
+from mimic.retargeting.costs import NO_COSTS, Costs, with_costs
+from mimic.retargeting.exact_pose import SET, exact_poses, exact_solver
+from mimic.retargeting.hand_target import HandError, Placement, placement
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
 from mimic.retargeting.multistart import Descents, Method, best_descent
 from mimic.retargeting.pose_objective import PoseObjective, pose_objective
 
 METHODS = ("newton", "gradient_descent")
+Hand = Literal["free", "exact"]
+HANDS = ("free", "exact")
 AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
 ITERATIONS = {"newton": 16, "gradient_descent": 1000}
-_NO_COSTS = Costs()
+STARTS = {"free": 12, "exact": 24}
 FLAT = 1e-3  # gradient [1/rad] of a converged pose, as a fraction of the mean distance of random poses
 
 
@@ -41,12 +45,15 @@ class PoseImitation(NamedTuple):
       qpos: [*batch, learner_joints] angles [rad].
       distance: [*batch] embodiment distance at these poses.
       converged: [*batch] whether the gradient vanishes, apart from joints at a limit. Matching positions are a kink of
-        the distance; there it is the gradient of the smoothed distance (see `mimic.retargeting.closed_form`).
+        the distance; there it is the gradient of the smoothed distance (see `mimic.retargeting.closed_form`). With
+        exact hands, whether the hand is exact.
+      hand: its error, with exact hands.
     """
 
     qpos: Float[Array, "*batch learner_joints"]
     distance: Float[Array, "*batch"]
     converged: Bool[Array, "*batch"]
+    hand: HandError | None = None
 
 
 def imitate_pose(
@@ -56,7 +63,9 @@ def imitate_pose(
     correspondence: Correspondence,
     weights: Weights,
     *,
-    starts: int = 12,
+    hand: Hand = "free",
+    base: Any = None,
+    starts: int | None = None,
     key: Array | None = None,
     warm_start: Float[ArrayLike, "*batch learner_joints"] | None = None,
     method: Method = "newton",
@@ -89,7 +98,14 @@ def imitate_pose(
       qpos: [n] or [..., n] the expert's poses [rad].
       correspondence: see `embodiment_distance`.
       weights: see `embodiment_distance`; velocities are zero.
-      starts: number of random initial guesses; with 0 the expert's angles are the only one.
+      hand: "exact" puts the learner's hand where the expert's is, in metres, and takes of all postures with this hand
+        within the joint ranges the one of minimum distance. Where none is found, as with fewer than six joints or out
+        of reach, the hand's position is the nearest, and then its rotation: see `PoseImitation.hand`. Costs count among
+        postures with this hand; `method`, `iterations` and `kept` are of "free", which leaves the hand to the metric.
+      base: the learner's base in the expert's base frame, for exact hands: [x, y, z, yaw] [m, rad], or a pose [4, 4];
+        None for the same base. Link directions are compared in the same axes, positions each from its own base.
+      starts: number of random initial guesses, 12 where None, 24 for exact hands; with 0 the expert's angles are the
+        only one.
       key: of the random poses; `jax.random.key(0)` where None.
       warm_start: [..., n_hat] replaces all initial guesses.
       method: "newton" or "gradient_descent".
@@ -109,11 +125,12 @@ def imitate_pose(
     check_choice("method", method, METHODS)
     # Longer than 40 lines: argument checks, and functions that share the arguments.
     count = ITERATIONS[method] if iterations is None else iterations
+    starts = STARTS[hand] if starts is None else starts
     if starts < 0 or count < 2:
         raise ValueError(f"starts, iterations: expected at least 0 and 2, got {starts} and {count}")
     if kept is not None and kept < 1:
         raise ValueError(f"kept: expected at least 1, or None for all, got {kept}")
-    costs = _NO_COSTS if costs is None else costs
+    costs = NO_COSTS if costs is None else costs
     costs.check_capsules(capsules)
     if costs.of_motion:
         raise ValueError(
@@ -121,8 +138,12 @@ def imitate_pose(
         )
     warm = None if warm_start is None else checked_poses(learner, _concrete(warm_start), "warm_start")
     metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
+    check_hand(hand, base, expert, learner)
     descents = Descents(method, count, kept)
     dtype = jax.dtypes.canonicalize_dtype(poses.dtype)
+    if hand == "exact":
+        solve = _exact_solver(expert, learner, metric, bool(starts), costs, capsules if costs.of_capsules else None)
+        return solve(poses, placement(base), warm, random_poses(learner, key, max(starts, 1), dtype, SET))
     candidates = random_poses(learner, key, max(starts, 1), dtype)
     if isinstance(expert, ArmArrays) or isinstance(learner, ArmArrays):
         data = _data_of(expert, learner, metric, costs, dtype)
@@ -158,6 +179,43 @@ def _pose_solver(
     return solve
 
 
+def check_hand(hand: Hand, base: Any, expert: Embodiment | ArmArrays, learner: Embodiment | ArmArrays) -> None:
+    """Raises a `ValueError` for an unknown `hand`, arms as data with exact hands, or a base without these."""
+    check_choice("hand", hand, HANDS)
+    if hand == "free" and base is not None:
+        raise ValueError('base: expected None for hand="free", which compares each arm from its own base')
+    if hand == "exact" and (isinstance(expert, ArmArrays) or isinstance(learner, ArmArrays)):
+        raise ValueError('hand: expected embodiments for "exact", got an arm as data')
+    for name, arm in (("expert", expert), ("learner", learner)):
+        if hand == "exact" and not arm.hand_joint:  # type: ignore[union-attr]
+            raise ValueError(f'hand: expected arms with a hand for "exact", got none of the {name}, {arm.name}')
+
+
+@compiled_once
+def _exact_solver(
+    expert: Embodiment,
+    learner: Embodiment,
+    metric: Metric,
+    random: bool,
+    costs: Costs,
+    capsules: Capsules | None,
+) -> Callable[[Array, Placement, Array | None, RandomPoses], PoseImitation]:
+    """As `_pose_solver`, for exact hands; it also takes the learner's base."""
+    solver = exact_solver(expert, learner, metric, costs, capsules)
+
+    def solve(batch: Array, base: Placement, warm: Array | None, candidates: RandomPoses) -> PoseImitation:
+        poses = jnp.asarray(batch).reshape(-1, expert.num_joints)
+        guess = shared_joints(expert, learner, poses)
+        if warm is not None:
+            guess = jnp.broadcast_to(jnp.asarray(warm).reshape(-1, learner.num_joints), guess.shape)
+        qpos, distance, error = exact_poses(solver, base, poses, guess, candidates if random and warm is None else None)
+        qpos = wrap_angles(qpos, continuous_joints(learner))
+        solutions = PoseImitation(qpos, distance, error.exact, error)
+        return jax.tree.map(lambda x: x.reshape(*batch.shape[:-1], *x.shape[1:]), solutions)
+
+    return solve
+
+
 class _PoseData(NamedTuple):
     """What the compiled function of arms as data takes beside the poses.
 
@@ -185,7 +243,7 @@ def _data_of(expert: Any, learner: Any, metric: Metric, costs: Costs, dtype: Any
     """
     if not (isinstance(expert, ArmArrays) and isinstance(learner, ArmArrays)):
         raise ValueError("expert, learner: expected two embodiments or two arms as data, got one of each")
-    if not metric.is_weighted_sum or costs != _NO_COSTS:
+    if not metric.is_weighted_sum or costs != NO_COSTS:
         raise ValueError(
             "metric, costs: expected a constant correspondence and weights, the reduction mean and no costs for arms "
             "as data; embodiments take all"

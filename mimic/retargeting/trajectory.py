@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +14,28 @@ from jaxtyping import Array, Float
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints, pose_limits
-from mimic.base.compilation import compiled_once
+from mimic.base.compilation import compiled_once, has_tracer
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.hand import NO_HAND, HandWeights
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.closed_form import ROUGH_SMOOTHING
 from mimic.retargeting.costs import Costs, smoothness_derivatives, sum_of, with_costs
+from mimic.retargeting.exact_pose import SET
+from mimic.retargeting.exact_trajectory import exact_trajectory
+from mimic.retargeting.hand_target import placement
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
 from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, Store, newton
-from mimic.retargeting.pose import FLAT, ITERATIONS, PoseImitation, checked_poses, shared_joints, wrap_angles
+from mimic.retargeting.pose import (
+    FLAT,
+    ITERATIONS,
+    STARTS,
+    Hand,
+    PoseImitation,
+    check_hand,
+    checked_poses,
+    shared_joints,
+    wrap_angles,
+)
 from mimic.retargeting.pose_objective import PoseObjective, Target, pose_objective
 
 _TRACKING_ITERATIONS = 6  # Newton steps from the pose at the neighbouring time
@@ -36,8 +50,10 @@ def imitate_trajectory(
     correspondence: Correspondence,
     weights: Weights,
     *,
+    hand: Hand = "free",
+    base: Any = None,
     largest_jump: Float[ArrayLike, " learner_joints"] | float = 0.3,
-    starts: int = 12,
+    starts: int | None = None,
     key: Array | None = None,
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
@@ -60,6 +76,9 @@ def imitate_trajectory(
       qpos: [T, n] the expert's motion [rad].
       correspondence: see `embodiment_distance`.
       weights: see `embodiment_distance`; velocities are zero.
+      hand: see `imitate_pose`. With exact hands the motion is exact as often as it can be within the joint ranges and
+        `largest_jump`, for which give the velocity limits times the time step, and then of least mean distance.
+      base: see `imitate_pose`.
       largest_jump: maximum change of a joint between two times [rad], one number or one for each joint.
       starts: see `imitate_pose`.
       key: see `imitate_pose`.
@@ -78,13 +97,22 @@ def imitate_trajectory(
         raise ValueError(f"qpos: expected shape [time, {expert.num_joints}], got {poses.shape}")
     if not np.all(np.asarray(largest_jump) > 0):
         raise ValueError(f"largest_jump: expected angles above 0 rad, got {largest_jump}")
+    check_hand(hand, base, expert, learner)
+    starts = STARTS[hand] if starts is None else starts
     if starts < 0:
         raise ValueError(f"starts: expected at least 0, got {starts}")
     costs = Costs() if costs is None else costs
     costs.check_capsules(capsules)
     jump = jnp.broadcast_to(jnp.asarray(largest_jump, poses.dtype), (learner.num_joints,))
     metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
-    solve = _trajectory_solver(expert, learner, metric, bool(starts), costs, capsules if costs.of_capsules else None)
+    capsules = capsules if costs.of_capsules else None
+    if hand == "exact":
+        if costs.of_motion or has_tracer(poses):
+            raise ValueError("costs, qpos: expected no costs of motion and no tracer for exact hands")
+        motion, limit = np.asarray(poses, np.float32), np.asarray(jump, np.float32)
+        random = random_poses(learner, key, max(starts, 1), np.float32, SET)
+        return exact_trajectory(expert, learner, metric, motion, placement(base), limit, random, costs, capsules)
+    solve = _trajectory_solver(expert, learner, metric, bool(starts), costs, capsules)
     return solve(poses, jump, random_poses(learner, key, max(starts, 1), poses.dtype))
 
 

@@ -1,0 +1,99 @@
+"""Where the base of an arm stands so that its hand reaches what the expert's reaches."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float
+
+from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import continuous_joints
+from mimic.metric.distance import Correspondence, Weights
+from mimic.retargeting.hand_target import Placement, placement
+from mimic.retargeting.pose import checked_poses, imitate_pose
+from mimic.retargeting.trajectory import imitate_trajectory
+
+_FRAMES, _BASES, _ROUNDS = 16, 64, 3  # frames that judge a base, bases in each round of the search, and rounds
+_SPREAD = np.array([0.5, 0.5, 0.2, np.pi])  # of the first round: chain lengths of the expert, and rad
+_NARROWER = 0.35  # factor of the spread from one round to the next
+_BEST, _CHECKED = 4, 3  # bases that the next round starts from, and those that are checked on whole motions
+_ROOM, _DISTANCE = 0.2, 0.1  # of the score: room in the joint ranges and embodiment distance; an exact hand has 1
+
+
+def find_base(
+    expert: Embodiment,
+    learner: Embodiment,
+    motions: Sequence[Float[ArrayLike, "time joints"]],
+    correspondence: Correspondence,
+    weights: Weights,
+    *,
+    largest_jump: Float[ArrayLike, " learner_joints"] | float = 0.3,
+    seed: int = 0,
+) -> Float[np.ndarray, "4"]:
+    """The base [x, y, z, yaw] of the learner from which most hands are exact, with room in the joint ranges.
+
+    A random search that narrows in three rounds judges bases by frames of all motions. The best ones are then compared
+    on the longest motion, within `largest_jump`.
+
+    Args:
+      expert: n joints.
+      learner: n_hat joints.
+      motions: of the expert, [T, n] each [rad].
+      correspondence: see `embodiment_distance`.
+      weights: see `embodiment_distance`.
+      largest_jump: see `imitate_trajectory`.
+      seed: of the search.
+
+    Returns:
+      The base in the expert's base frame [m, rad], as `imitate_pose` and `imitate_trajectory` take it.
+
+    Raises:
+      ValueError: no motion, or what `imitate_trajectory` rejects.
+    """
+    if not len(motions):
+        raise ValueError("motions: expected at least one, got none")
+    paths = [checked_poses(expert, np.asarray(motion, np.float32), "motions", axes=("time",)) for motion in motions]
+    frames = np.concatenate(paths)
+    frames = frames[np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int)]
+    generator, spread = np.random.default_rng(seed), _SPREAD * np.array([*[float(expert.chain_length)] * 3, 1.0])
+    bases, scores = np.zeros((1, 4)), np.full(1, -np.inf)
+    for _ in range(_ROUNDS):
+        new = bases[np.arange(_BASES) % len(bases)] + generator.uniform(-spread, spread, (_BASES, 4))
+        new[0] = bases[0]
+        of_new = _scores(expert, learner, frames, new, correspondence, weights)
+        bases, scores = np.concatenate([bases, new]), np.concatenate([scores, of_new])
+        order = np.argsort(-scores, kind="stable")[:_BEST]
+        bases, scores, spread = bases[order], scores[order], spread * _NARROWER
+    longest = max(paths, key=len)
+
+    def of_motion(base: np.ndarray) -> tuple[float, float]:
+        options: dict[str, Any] = {"hand": "exact", "base": base, "largest_jump": largest_jump}
+        motion = imitate_trajectory(expert, learner, longest, correspondence, weights, **options)
+        assert motion.hand is not None
+        return float(motion.hand.exact.mean()), -float(motion.distance.mean())
+
+    return max(bases[:_CHECKED], key=of_motion)
+
+
+def _scores(
+    expert: Embodiment,
+    learner: Embodiment,
+    frames: Float[np.ndarray, "frames joints"],
+    bases: Float[np.ndarray, "bases 4"],
+    correspondence: Correspondence,
+    weights: Weights,
+) -> Float[np.ndarray, " bases"]:
+    """Scores of bases: the mean over the frames of exact hands, room, and distance."""
+    poses, count = np.tile(frames, (len(bases), 1)), len(bases)
+    placements = [placement(base) for base in bases]
+    stacked = Placement(
+        *(np.repeat(np.stack(part, axis=-1), len(frames), axis=-1) for part in zip(*placements, strict=True))
+    )
+    solution = jax.device_get(imitate_pose(expert, learner, poses, correspondence, weights, hand="exact", base=stacked))
+    lower, upper = np.asarray(learner.joint_range).T
+    room = 2 * np.minimum(solution.qpos - lower, upper - solution.qpos) / (upper - lower)
+    room = np.where(continuous_joints(learner), 1, room).min(axis=-1)
+    score = np.where(solution.hand.exact, 1 + _ROOM * room - _DISTANCE * solution.distance, 0)
+    return score.reshape(count, -1).mean(axis=-1)

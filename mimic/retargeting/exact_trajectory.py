@@ -1,0 +1,235 @@
+"""Motions of the learner whose hand is where the expert's is, in one continuous path of least distance.
+
+The branches of postures are searched at some times, the anchors, and tracked from each to its neighbours, forwards and
+backwards, within the velocity limits. So each time has a set of candidates. Dynamic programming finds the path through
+them that is exact as often as it can be, and then of least distance. Where this path changes branch faster than the
+velocity limits allow, the arm follows it as fast as it may, with an exact hand if it is redundant.
+
+JAX computes chunks of a fixed number of times, so that motions of all lengths share its compiled functions.
+"""
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mimic.arms.capsules import Capsules
+from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import continuous_joints, pose_limits
+from mimic.base.compilation import compiled_once
+from mimic.metric.distance import Metric
+from mimic.retargeting.costs import NO_COSTS, Costs
+from mimic.retargeting.exact_pose import DESCENTS, FINE, ExactTargets, exact_solver
+from mimic.retargeting.hand_target import HandError, Placement, hand_cost_derivatives, is_exact
+from mimic.retargeting.initial_guesses import RandomPoses
+from mimic.retargeting.optimizers import Derivatives, Scalars, Store, newton
+from mimic.retargeting.pose import PoseImitation, shared_joints, wrap_angles
+
+SPACING, SEGMENTS = 16, 16  # times from one anchor to the next, and such segments in a chunk
+CHUNK = SPACING * SEGMENTS
+_STEPS, _DAMPING = 4, 1e-3  # Newton's method from the neighbouring time
+_SLACK = 0.95  # of the maximum change for candidates, which are finished afterwards
+_LEAP = 1.001  # of the maximum change: a path that changes by more passes to another branch
+_INEXACT = 10.0  # distance that an exact hand is worth, at each time
+_PER_METRE = 1e3  # of the error of a hand that is not exact
+_PER_STEP = 1.0  # distance that a step on the way to another branch costs, of arms that stay exact meanwhile
+_POSITION_FIRST = 1e-3  # weight of the rotation of a hand that is not exact
+
+
+class Candidates(NamedTuple):
+    """Postures at each time.
+
+    Attributes:
+      qpos: [time, candidates, joints] [rad].
+      cost: [time, candidates] distance, and more where the hand is not exact.
+    """
+
+    qpos: Float[Any, "time candidates joints"]
+    cost: Float[Any, "time candidates"]
+
+
+def exact_trajectory(
+    expert: Embodiment,
+    learner: Embodiment,
+    metric: Metric,
+    poses: Float[np.ndarray, "time joints"],
+    base: Placement,
+    jump: Float[np.ndarray, " learner_joints"],
+    random: RandomPoses,
+    costs: Costs = NO_COSTS,
+    capsules: Capsules | None = None,
+) -> PoseImitation:
+    """The motion; see `imitate_trajectory`."""
+    arms, times = (expert, learner, metric, costs, capsules), len(poses)
+    tracked = _candidates(*arms)
+    chunks = [tracked(x, base, random, jump) for x in in_chunks(poses, CHUNK + 1, 1)]
+    candidates = Candidates(*(np.concatenate(jax.device_get(part))[:times] for part in zip(*chunks, strict=True)))
+    is_redundant = learner.num_joints > 6 * len(learner.hand_joint)
+    path = best_path(candidates, jump, continuous_joints(learner), _PER_STEP if is_redundant else _INEXACT)
+    qpos = within_ranges(path, np.asarray(learner.joint_range))
+    if np.any(np.abs(np.diff(qpos, axis=0)) > jump):
+        qpos = _followed(arms, poses, qpos, base, jump, is_redundant)
+    distance, position, rotation = _by_chunks(lambda x, qpos: _report(*arms)(x, base, qpos), poses, qpos)
+    lower, upper = np.asarray(learner.joint_range).T
+    endless = upper - lower < 2 * np.pi + 1e-4  # of a full revolution and no more: without limits
+    inside = (qpos >= lower - 1e-6) & (qpos <= upper + 1e-6) | (continuous_joints(learner) & endless)
+    qpos, distance, position, rotation = map(jnp.asarray, (qpos, distance, position, rotation))
+    exact = is_exact(position, rotation) & inside.all(axis=-1)
+    return PoseImitation(qpos, distance, exact, HandError(position, rotation, exact))
+
+
+def in_chunks(rows: np.ndarray, size: int, overlap: int = 0) -> Iterator[np.ndarray]:
+    """The rows in chunks of one size; the last one is padded with its last row."""
+    for start in range(0, max(len(rows) - overlap, 1), size - overlap):
+        chunk = rows[start : start + size]
+        yield np.concatenate([chunk, np.repeat(chunk[-1:], size - len(chunk), axis=0)])
+
+
+def _by_chunks(function: Callable[..., Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """A function of chunks of rows, for all rows."""
+    chunks = zip(*(in_chunks(array, CHUNK) for array in arrays), strict=True)
+    results = [function(*chunk) for chunk in chunks]
+    return tuple(np.concatenate(jax.device_get(part))[: len(arrays[0])] for part in zip(*results, strict=True))
+
+
+@compiled_once
+def _candidates(*arms: Any) -> Callable[..., Candidates]:
+    """The function from CHUNK + 1 poses, a placement, random poses and the maximum change to CHUNK candidates."""
+    solver = exact_solver(*arms)
+    lower, upper = (x[:, None, None] for x in pose_limits(solver.learner, np.float32))
+    anchors, steps = np.arange(SEGMENTS + 1) * SPACING, np.arange(1, SPACING + 1)[:, None]
+    times = np.concatenate([anchors[:-1] + steps, anchors[1:] - steps], axis=1)
+
+    def track(targets: ExactTargets, begin: Array, jump: Array) -> Array:
+        """[SPACING, joints, lanes, 2 SEGMENTS] candidates from those at the anchors."""
+
+        def step(qpos: Array, now: Array) -> tuple[Array, Array]:
+            box = jnp.maximum(lower, qpos - jump), jnp.minimum(upper, qpos + jump)
+            of_time = functools.partial(solver.derivatives(at(targets, now)), smoothing=FINE)
+            qpos = newton(of_time, qpos, box, _STEPS, _DAMPING).qpos
+            return qpos, qpos
+
+        return jax.lax.scan(step, begin, jnp.asarray(times))[1]
+
+    def chunk(poses: Array, base: Placement, random: RandomPoses, jump: Array) -> Candidates:
+        targets, states = solver.targets(base, poses)
+        first = shared_joints(solver.expert, solver.learner, poses[anchors])
+        branches = solver.branches(at(targets, anchors), first, random, DESCENTS)
+        begin = jnp.concatenate([branches[..., :-1], branches[..., 1:]], axis=-1)
+        tracks = track(targets, begin, (_SLACK * jump).astype(poses.dtype)[:, None, None])
+        forwards = jnp.concatenate([begin[None, ..., :SEGMENTS], tracks[:-1, ..., :SEGMENTS]])
+        both = jnp.concatenate([forwards, tracks[::-1, ..., SEGMENTS:]], axis=2)
+        qpos = jnp.moveaxis(both, 0, -1).reshape(*both.shape[1:3], -1)  # [joints, candidates, times]
+        inner = np.arange(CHUNK)
+        qpos = solver.finished(at(targets, inner), qpos)
+        position, rotation = solver.errors(at(targets, inner), qpos)
+        cost = solver.distances(at(states, inner), qpos) + solver.costs_of(poses[:-1], qpos)
+        inexact = _INEXACT + _PER_METRE * position + rotation
+        return Candidates(qpos.T, (cost + jnp.where(is_exact(position, rotation), 0, inexact)).T)
+
+    return chunk
+
+
+def at(tree: Any, index: Any) -> Any:
+    """Arrays at some indices of their last axis."""
+    return jax.tree.map(lambda x: x[..., index], tree)
+
+
+def best_path(
+    candidates: Candidates, jump: np.ndarray, continuous: np.ndarray, cost_of_step: float
+) -> Float[np.ndarray, "time joints"]:
+    """The candidates with the minimum sum of costs, and of steps on the way to others, by dynamic programming.
+
+    Args:
+      candidates: at each time.
+      jump: maximum change of each joint from one time to the next [rad].
+      continuous: joints whose full revolutions do not count.
+      cost_of_step: for each time by which a change takes longer than the next time.
+    """
+    qpos, cost = candidates
+    total, before = cost[0], []
+    for previous, now, own in zip(qpos[:-1], qpos[1:], cost[1:], strict=True):
+        apart = np.abs(wrap_angles(now - previous[:, None], continuous))
+        through = total[:, None] + cost_of_step * np.maximum(np.ceil((apart / jump).max(axis=-1)) - 1, 0)
+        before.append(through.argmin(axis=0))
+        total = own + through.min(axis=0)
+    index = [int(total.argmin())]
+    for row in reversed(before):
+        index.append(int(row[index[-1]]))
+    path = qpos[np.arange(len(qpos)), index[::-1]]
+    change = wrap_angles(np.diff(path, axis=0), continuous)
+    return np.concatenate([path[:1], path[0] + np.cumsum(change, axis=0)])
+
+
+def within_ranges(
+    path: Float[np.ndarray, "time joints"], ranges: Float[np.ndarray, "joints 2"]
+) -> Float[np.ndarray, "time joints"]:
+    """The path, with joints of more than a full revolution shifted by full revolutions to the middle of their range."""
+    middle = (path.min(axis=0) + path.max(axis=0)) / 2
+    revolutions = np.round((middle - ranges.mean(axis=1)) / (2 * np.pi))
+    return path - 2 * np.pi * np.where(np.ptp(ranges, axis=1) >= 2 * np.pi - 1e-4, revolutions, 0)
+
+
+@compiled_once
+def _report(*arms: Any) -> Callable[..., tuple[Array, Array, Array]]:
+    """The function from CHUNK poses, a placement and angles to distances and errors of the hand [m, rad]."""
+    solver = exact_solver(*arms)
+
+    def report(poses: Array, base: Placement, qpos: Array) -> tuple[Array, Array, Array]:
+        targets, states = solver.targets(base, poses)
+        lanes = qpos.astype(poses.dtype).T[:, None]
+        position, rotation = solver.errors(targets, lanes)
+        return solver.distances(states, lanes)[0], position[0], rotation[0]
+
+    return report
+
+
+def _followed(
+    arms: tuple[Any, ...],
+    poses: np.ndarray,
+    path: np.ndarray,
+    base: Placement,
+    jump: np.ndarray,
+    is_redundant: bool,
+) -> np.ndarray:
+    """A path as fast as the maximum change allows."""
+    follow, last, chunks = _follower(is_redundant, *arms), path[0].astype(np.float32), []
+    for of_expert, of_path in zip(in_chunks(poses, CHUNK), in_chunks(path, CHUNK), strict=True):
+        chunks.append(np.asarray(follow(of_expert, base, of_path, last, jump)))
+        last = chunks[-1][-1]
+    return np.concatenate(chunks)[: len(path)]
+
+
+@compiled_once
+def _follower(is_redundant: bool, *arms: Any) -> Callable[..., Array]:
+    """The function from CHUNK poses, a placement, a path, the angles before it and the maximum change to angles."""
+    solver = exact_solver(*arms)
+    lower, upper = pose_limits(solver.learner, np.float32)
+
+    def chunk(poses: Array, base: Placement, path: Array, last: Array, jump: Array) -> Array:
+        targets, _ = solver.targets(base, poses)
+        path, jump = path.astype(poses.dtype), (jump * (1 - 1e-5)).astype(poses.dtype)
+        exact = is_exact(*solver.errors(targets, path.T))
+
+        def follow(last: Array, now: tuple[ExactTargets, Array, Array]) -> tuple[Array, Array]:
+            target, goal, exact = now
+            box = jnp.maximum(lower, last - jump), jnp.minimum(upper, last + jump)
+            leaps = jnp.any(jnp.abs(goal - last) > _LEAP * jump)
+            weight = jnp.where(exact, 1, _POSITION_FIRST).astype(last.dtype)
+
+            def derivatives(qpos: Scalars, store: Store) -> Derivatives:
+                return hand_cost_derivatives(solver.learner, solver.pairs[:, 1], target.hands, qpos, weight, store)
+
+            goal = jnp.clip(goal, last - jump, last + jump)
+            qpos = newton(derivatives, goal, box, _STEPS, _DAMPING).qpos
+            qpos = qpos if is_redundant else jnp.where(leaps, goal, qpos)
+            return qpos, qpos
+
+        of_times = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), targets)
+        return jax.lax.scan(follow, last, (of_times, path, exact))[1]
+
+    return chunk
