@@ -8,9 +8,10 @@ fr3= without a file is the Panda with other ranges. ssik and mink must be instal
 
 Random poses: within the Panda's joint ranges, with both bases at one place. `solved` is the fraction of the poses that
 ssik (closed form) solves which `imitate_pose` solves too; `unsolved_by_ssik` counts what it solves beyond. Hands are
-checked in double precision. Demonstrations: recordings of robosuite, with a base from `find_base`. ssik starts each
-time from the last solution, mink tracks the hand in ten steps. The elbow is compared in chain lengths in the axes of
-the expert's base, and the plane of shoulder, elbow and wrist by its normal, where exact.
+checked in double precision. Demonstrations: recordings of robosuite, with a base from `find_base`. ssik takes the
+solution nearest to the last one, and the first one to the home pose, from where mink tracks the hand in ten steps a
+frame. The elbow is compared in chain lengths in the axes of the expert's base, and the plane of shoulder, elbow and
+wrist by its normal.
 """
 
 import argparse
@@ -114,7 +115,8 @@ def closed_form(arm: Embodiment) -> Callable[..., np.ndarray | None]:
 
 
 def random_row(expert: Embodiment, name: str, learner: Embodiment, count: int) -> Row:
-    qpos = np.random.default_rng(0).uniform(*expert.joint_range.T, (count, expert.num_joints)).astype(np.float32)
+    lower, upper = expert.joint_range.T
+    qpos = np.random.default_rng(0).uniform(lower, upper, (count, expert.num_joints)).astype(np.float32)
     targets, metric = hand_matrices(expert, qpos.astype(float)), MetricConfig().build(expert, learner)
     solve, began = closed_form(learner), time.perf_counter()
     by_ssik = np.array([solve(target) is not None for target in targets])
@@ -124,24 +126,27 @@ def random_row(expert: Embodiment, name: str, learner: Embodiment, count: int) -
     position, rotation = (x[exact].max() for x in errors(learner, solution.qpos.astype(float), targets))
     lower, upper = learner.joint_range.T
     assert np.all((solution.qpos[exact] > lower - 1e-6) & (solution.qpos[exact] < upper + 1e-6))
-    return {
-        "learner": name,
-        "joints": learner.num_joints,
-        "poses": count,
-        "ssik_solves": by_ssik.mean(),
-        "ssik_ms": ssik_ms,
-        "solved": exact[by_ssik].mean(),
-        "unsolved_by_ssik": int(np.sum(exact & ~by_ssik)),
-        "position_error_um": 1e6 * position,
-        "rotation_error_mdeg": 1e3 * np.degrees(rotation),
-        "distance": solution.distance[exact].mean(),
-    }
+    return as_numbers(
+        {
+            "learner": name,
+            "joints": learner.num_joints,
+            "poses": count,
+            "ssik_solves": by_ssik.mean(),
+            "ssik_ms": ssik_ms,
+            "solved": exact[by_ssik].mean(),
+            "unsolved_by_ssik": int(np.sum(exact & ~by_ssik)),
+            "position_error_um": 1e6 * position,
+            "rotation_error_mdeg": 1e3 * np.degrees(rotation),
+            "distance": solution.distance[exact].mean(),
+        }
+    )
 
 
 def throughput_row(expert: Embodiment, name: str, learner: Embodiment, count: int, runs: int = 5) -> Row:
     """Poses a second of one batch, after compilation; the median over runs."""
     metric = MetricConfig().build(expert, learner).arguments
-    batches = np.random.default_rng(0).uniform(*expert.joint_range.T, (runs + 1, count, expert.num_joints))
+    lower, upper = expert.joint_range.T
+    batches = np.random.default_rng(0).uniform(lower, upper, (runs + 1, count, expert.num_joints))
     times = []
     for batch in jax.numpy.asarray(batches, np.float32):
         began = time.perf_counter()
@@ -149,7 +154,12 @@ def throughput_row(expert: Embodiment, name: str, learner: Embodiment, count: in
         times.append(time.perf_counter() - began)
     rates = count / np.array(times[1:])
     row = {"learner": name, "poses": count, "exact": float(solution.hand.exact.mean()), "first_s": times[0]}
-    return {**row, "poses_per_s": float(np.median(rates)), "slowest": rates.min(), "fastest": rates.max()}
+    return as_numbers({**row, "poses_per_s": np.median(rates), "slowest": rates.min(), "fastest": rates.max()})
+
+
+def as_numbers(row: Row) -> Row:
+    """The row with Python's numbers in place of NumPy's."""
+    return {key: value.item() if isinstance(value, np.generic) else value for key, value in row.items()}
 
 
 def followed_by_ssik(arm: Embodiment, targets: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -238,11 +248,11 @@ def motion_rows(
             mimic.imitate_trajectory(*arms, qpos, **metric.arguments, hand="exact", base=base, largest_jump=jump)
         )
 
-    first = imitate().qpos[0].astype(float)
+    home = np.asarray(learner.home, float)
     methods: dict[str, Callable[[], np.ndarray]] = {
         "mimic": lambda: imitate().qpos,
-        "ssik, seeded": lambda: followed_by_ssik(learner, targets, first),
-        "mink": lambda: followed_by_mink(learner, targets, first),
+        "ssik, seeded": lambda: followed_by_ssik(learner, targets, home),
+        "mink": lambda: followed_by_mink(learner, targets, home),
     }
     for method, solve in methods.items():
         began = time.perf_counter()
@@ -251,20 +261,22 @@ def motion_rows(
         position, rotation = errors(learner, own, targets)
         exact = (position <= 1e-4) & (rotation <= np.radians(0.01))
         fastest = np.abs(np.diff(own, axis=0)).max(axis=0) / jump
-        yield {
-            "learner": name,
-            "demonstration": task,
-            "method": method,
-            "frames": len(qpos),
-            "base": base.tolist(),
-            "base_s": base_s,
-            "exact": exact.mean(),
-            "position_mm": 1e3 * position.max(),
-            "rotation_deg": np.degrees(rotation.max()),
-            "fastest": fastest.max(),
-            "fps": len(qpos) / seconds,
-            **posture(expert, learner, base, qpos.astype(float), own),
-        }
+        yield as_numbers(
+            {
+                "learner": name,
+                "demonstration": task,
+                "method": method,
+                "frames": len(qpos),
+                "base": base.tolist(),
+                "base_s": base_s,
+                "exact": exact.mean(),
+                "position_mm": 1e3 * position.max(),
+                "rotation_deg": np.degrees(rotation.max()),
+                "fastest": fastest.max(),
+                "fps": len(qpos) / seconds,
+                **posture(expert, learner, base, qpos.astype(float), own),
+            }
+        )
 
 
 def measure(options: argparse.Namespace, arms: list[tuple[str, Embodiment]]) -> None:

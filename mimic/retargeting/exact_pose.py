@@ -150,20 +150,23 @@ class ExactSolver(NamedTuple):
     ) -> Float[Array, "joints kept poses"]:
         """Postures on different branches, with hands that are nearly exact, from a first guess and random poses."""
         limits = pose_limits(self.learner, first.dtype)
-        nearest = jax.vmap(functools.partial(self._nearest, random), -1, -1)(targets)
-        guesses = jnp.concatenate([first.T[None], nearest])
+        guesses = jnp.concatenate([first.T[None], self._nearest(random, targets.hands)])
         return kept_descents(self.derivatives(targets), guesses, limits, descents, (_ROUGH, FINE), _APART).qpos
 
-    def _nearest(self, random: RandomPoses, target: ExactTargets) -> Float[Array, "sets joints"]:
-        """The random pose of each set whose hand and posture are nearest to those of one target."""
-        qpos = jnp.asarray(random.qpos)
-        table = hands(self.learner, [*jnp.moveaxis(qpos, -1, 0)], self.pairs[:, 1])
-        apart = (table.position - target.hands.position[..., None, None]) / float(self.learner.chain_length)
-        turned = table.axes - target.hands.axes[..., None, None]
-        cost = 2 * jnp.sum(apart * apart, (0, 1)) + jnp.sum(turned * turned, (0, 1, 2)) / 4
-        posture = jax.vmap(jax.vmap(lambda states: self.objective.value(target.metric, states)))(random.states)
-        index = jnp.argmin(cost + posture, axis=1)
-        return jnp.take_along_axis(qpos, index[:, None, None], axis=1)[:, 0]
+    def _nearest(self, random: RandomPoses, target: HandTarget) -> Float[Array, "sets joints poses"]:
+        """The random pose of each set whose hand is nearest to each target."""
+        hand, chosen = random.states.hand, self.pairs[:, 1]
+        assert hand is not None
+        shape = hand.position.shape[:2]
+        position = hand.position[:, :, chosen].reshape(*shape, -1)
+        axes = hand.axes.reshape(*shape, -1, 9)[:, :, chosen].reshape(*shape, -1)
+        goal = target.position.reshape(-1, target.position.shape[-1]) / float(self.learner.chain_length)
+        goal = jnp.concatenate([goal, target.axes.reshape(-1, goal.shape[-1])])
+        # 2 |p - p^|^2 + (1 - cos theta), up to a constant of the target; rounding to TF32 does no harm here.
+        table = jnp.concatenate([4 * position, axes / 2], axis=-1)
+        cost = 2 * jnp.sum(position * position, -1)[..., None] - jnp.tensordot(table, goal, 1)
+        index = jnp.argmin(cost, axis=1)[:, None]
+        return jnp.take_along_axis(jnp.moveaxis(jnp.asarray(random.qpos), 1, -1), index, axis=-1)
 
     def distances(self, states: LinkStates, qpos: Float[Array, "joints lanes poses"]) -> Float[Array, "lanes poses"]:
         """Embodiment distance of each lane from the expert's link states [links, 3, poses]."""
