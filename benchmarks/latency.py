@@ -1,6 +1,6 @@
 """Latency of one pose on one core: warm-started from the last pose of a motion, and from 13 initial guesses.
 
-    python -m benchmarks.latency [--out FILE] [--poses 2000] [--runs 5]
+    python -m benchmarks.latency [--out FILE] [--poses 2000] [--runs 5] [--hand exact]
 
 The process is bound to one core of Linux, and XLA computes in the caller's thread, as a control loop would have it.
 `jit` is a caller inside `jax.jit`, `call` is `imitate_pose` itself, which also looks up what it compiled. Quantiles
@@ -23,7 +23,7 @@ from benchmarks.common.record import Row, collect
 from mimic.metric.config import MetricConfig
 
 COLUMNS = "start way p50_us:.0f p99_us:.0f lowest_p99_us:.0f"
-STARTS = ("warm", "13 initial guesses")
+STARTS = {"free": ("warm", "13 initial guesses"), "exact": ("warm", "25 initial guesses")}
 
 
 def bind_to_one_core() -> None:
@@ -53,14 +53,18 @@ def loop_seconds(repeats: int) -> np.ndarray:
     return np.array(times)
 
 
-def run_way(way: str, start: str, poses: int, runs: int) -> Row:
-    pair = mimic.panda(), mimic.panda(locked=(3, 6, 7))
-    metric = MetricConfig().build(*pair).arguments
-    imitate = functools.partial(mimic.imitate_pose, *pair, **metric)
+def run_way(way: str, start: str, poses: int, runs: int, hand: str) -> Row:
+    swing = np.sin(np.linspace(0, 20, poses)[:, None] + np.arange(7))
+    options: dict[str, Any] = {"hand": hand}
+    if hand == "exact":
+        arm = mimic.panda(limits="hardware")
+        pair, options["base"], swing = (arm, arm), [0.1, -0.1, 0.05, 0.3], arm.home + 0.3 * swing
+    else:
+        pair = mimic.panda(), mimic.panda(locked=(3, 6, 7))
+    imitate = functools.partial(mimic.imitate_pose, *pair, **MetricConfig().build(*pair).arguments, **options)
     if way == "jit":
         imitate = jax.jit(imitate)
-    phases = np.linspace(0, 20, poses)[:, None] + np.arange(7)
-    motion = np.sin(phases).astype(np.float32)
+    motion = swing.astype(np.float32)
     times = np.array([latencies(imitate, motion, warm=start == "warm") for _ in range(runs)])
     return row(start, way, times)
 
@@ -77,18 +81,18 @@ def row(start: str, way: str, times: np.ndarray) -> Row:
     }
 
 
-def measure(poses: int, runs: int) -> Iterator[Row]:
-    for start in STARTS:
+def measure(poses: int, runs: int, hand: str) -> Iterator[Row]:
+    for start in STARTS[hand]:
         for way in ("jit", "call"):
-            yield run_way(way, start, poses, runs)
+            yield run_way(way, start, poses, runs, hand)
     yield row("", "loop of Python", np.array([loop_seconds(poses) for _ in range(runs)]))
 
 
 def main() -> None:
-    options = make_parser("latency", __doc__, poses=2000, runs=5).parse_args()
+    options = make_parser("latency", __doc__, poses=2000, runs=5, hand="free").parse_args()
     bind_to_one_core()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    collect(options, measure(options.poses, options.runs), "results", COLUMNS)
+    collect(options, measure(options.poses, options.runs, options.hand), "results", COLUMNS)
 
 
 if __name__ == "__main__":
