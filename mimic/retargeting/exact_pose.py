@@ -59,6 +59,7 @@ _FINISHING = 5  # Newton steps of each stage without the metric
 # Rotation's weight in these stages, 1 for hands that are exact; damping; and angles [rad] that are added at the start,
 # because a straight arm is stationary and need not be nearest.
 _STAGES = (1.0, 1e-4, 0.0), (1e-3, 1e-2, 0.03), (1e-3, 1e-2, 0.0), (1e-3, 1e-3, 0.0), (0.0, 1e-4, 0.0)
+_WARM_STEPS = 10  # Newton steps from a warm start
 _APART = 0.1  # rad, between the poses of different branches
 DESCENTS, SET = Descents("newton", 20, 8), 64  # of each pose; random poses of which one is a guess
 _INEXACT, _POSITION_FIRST = 1e3, 1e4  # in the order of postures: of hands that are not exact, and per m of their error
@@ -212,7 +213,7 @@ def exact_poses(
     if random is None:
         limits, begin = pose_limits(solver.learner, poses.dtype), guess.astype(poses.dtype).T[:, None]
         of_targets = functools.partial(solver.derivatives(targets), smoothing=FINE)
-        near = newton(of_targets, begin, limits, DESCENTS.iterations).qpos
+        near = newton(of_targets, begin, limits, _WARM_STEPS).qpos
     else:
         near = solver.branches(targets, guess, random, DESCENTS)
     lanes = solver.finished(targets, near)
