@@ -252,6 +252,9 @@ def test_hands_move_as_in_mujoco_and_with_every_joint(name):
         angles = dict(zip(names, qpos, strict=True)) | {f"joint{joint}": angle for joint, angle in locked.items()}
         hands = hand_poses(arm.embodiment, qpos)
         np.testing.assert_allclose(hands, of_bodies(angles) @ T_body_hand, atol=1e-9)
+        frames = mimic.hand_frames(arm.embodiment, qpos)
+        np.testing.assert_allclose(frames.position, hands[:, :3, 3], atol=1e-6)  # float32
+        np.testing.assert_allclose(frames.rotation, hands[:, :3, :3], atol=2e-6)
         for joint in range(len(names)):  # of the pair each arm moves its own hand
             moved = np.abs(hand_poses(arm.embodiment, qpos + 0.1 * np.eye(len(names))[joint]) - hands)
             assert (moved.max(axis=(1, 2)) > 0.01).sum() == 1
