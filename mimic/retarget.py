@@ -1,4 +1,4 @@
-"""`python -m mimic.retarget demonstrations=FILE learner=ENV out=FILE`: retargets motions to another arm."""
+"""`python -m mimic.retarget source=DATA expert=ARM learner=ARM out=DIR`: a data set of one arm for another."""
 
 from mimic.commands import cli
 from mimic.commands.config import RetargetConfig

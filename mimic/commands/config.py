@@ -4,6 +4,7 @@ This module imports other configs only, so that `--help` stays fast.
 """
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -330,20 +331,39 @@ class InspectConfig:
         check_choice("limits", self.limits, LIMITS)
 
 
+_HANDS, _FAILING = ("exact", "near", "scaled"), ("left_out", "kept")
+_BASE = "x", "y", "z", "yaw"
+
+
 @dataclasses.dataclass(frozen=True)
 class RetargetConfig:
-    """Config of a retargeting of demonstrations.
+    """Config of a retargeting of a data set, or of demonstrations.
 
     Attributes:
-      demonstrations: file of the expert's demonstrations.
+      source: data set of the expert to write again as one of the learner, see `import_demonstrations` for formats.
+      hand: with `source`: "exact" for the expert's hand in metres, which each frame must keep; "near" for the nearest
+        one within the limits; "scaled" for the pose that resembles the expert's, in chain lengths.
+      base: with `source`: "same" for the learner's base where the expert's is, "auto" for where most frames are exact,
+        or [x,y,z,yaw] in the expert's base frame [m, rad].
+      failing: with `source`: what becomes of episodes that fail, "left_out" or "kept".
+      joints, topic, units, rate: of `source`, see `RecordingConfig`.
+      demonstrations: file of the expert's demonstrations, in place of `source`.
       env: environment that defines the arms and the metric.
       mapper: run directory of a pose mapper of these arms, used instead of the optimiser.
-      limits: see `EnvConfig`. Default None: those of the environment.
-      out: file of the learner's motions; must not exist.
+      limits: see `EnvConfig`. Default None: those of the environment; with `source` those of the models.
+      out: folder of the data set, or file of the learner's motions; must not exist.
       costs: see `Costs`; of the optimiser.
       seed: seed of the random initial poses of the optimiser.
     """
 
+    source: str = ""
+    hand: str = "exact"
+    base: Any = "same"
+    failing: str = "left_out"
+    joints: list[str] = dataclasses.field(default_factory=list)
+    topic: str = ""
+    units: str = ""
+    rate: float | None = number(None, at_least=0.1, at_most=1e5)
     demonstrations: str = ""
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
     mapper: str = ""
@@ -356,10 +376,30 @@ class RetargetConfig:
         check_ranges(self)
         if self.mapper and self.costs != Costs():
             raise ValueError("costs: expected none with a mapper, which does not minimise them")
+        if self.source and (self.demonstrations or self.mapper):
+            raise ValueError("source: expected neither demonstrations= nor mapper= with a data set")
+        check_choice("hand", self.hand, _HANDS)
+        check_choice("failing", self.failing, _FAILING)
+        _ = self.placement
+
+    @property
+    def placement(self) -> list[float] | None:
+        """The learner's base in the expert's base frame, [x, y, z, yaw] [m, rad]; None for the same or one to find.
+
+        Raises:
+          ValueError: `base` is nothing of the kind.
+        """
+        if isinstance(self.base, list | tuple) and len(self.base) == len(_BASE):
+            if all(isinstance(x, int | float) and math.isfinite(x) for x in self.base):
+                return [float(number) for number in self.base]
+        elif self.base in ("same", "auto"):
+            return None
+        raise ValueError(f"base: expected same, auto or [{','.join(_BASE)}], got {self.base!r}")
 
     def resolve(self) -> EnvConfig:
         """Returns the environment with the limits set in this config."""
-        return dataclasses.replace(self.env, **_without_none({"limits": self.limits}))
+        limits = self.limits or ("hardware" if self.source else None)
+        return dataclasses.replace(self.env, **_without_none({"limits": limits}))
 
 
 _LEARNERS = "panda", "panda4dof", "panda3dof"  # to choose from in a view

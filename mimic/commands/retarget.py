@@ -1,4 +1,4 @@
-"""`python -m mimic.retarget`: demonstrations of one arm as motions of another, pose by pose."""
+"""`python -m mimic.retarget`: a data set or demonstrations of one arm as those of another."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,6 +17,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints, pose_limits
 from mimic.base.config import new_file
 from mimic.commands.config import RetargetConfig
+from mimic.commands.retarget_data import prepare_data_set
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.config import MetricConfig
 from mimic.motions.demonstrations import Demonstrations, load_demonstrations
@@ -148,14 +149,19 @@ def _select_candidates(candidates: Array, distances: Array, largest_jump: np.nda
     return jnp.append(selected, last)
 
 
-def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
+def prepare_retargeting(config: RetargetConfig) -> Callable[[], int | None]:
     """Checks the config of a retargeting and loads its files.
 
     Raises:
       ValueError: a file name is missing, `out` exists, or a file belongs to other arms.
     """
+    if config.source:
+        return prepare_data_set(config)
     if not config.demonstrations:
-        raise ValueError("demonstrations: expected a file, as in demonstrations=FILE")
+        raise ValueError(
+            "source, demonstrations: expected a data set or a file of demonstrations, as in source=FOLDER or "
+            "demonstrations=FILE"
+        )
     out = new_file("out", config.out)
     env = config.resolve()
     expert, learner = env.build_arms().embodiments

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.motions.cleaning import Notes, cleaned
+from mimic.motions.cleaning import OVERSHOOT, Notes, cleaned
 from mimic.motions.formats.episodes import Motion, Recording
 from mimic.motions.formats.hdf5 import is_hdf5
 from mimic.motions.formats.hdf5_rewriting import rewrite_hdf5
@@ -66,35 +66,37 @@ def read_data_set(
     topic: str = "",
     units: str = "",
     rate: float | None = None,
+    joint_range: Float[np.ndarray, "joints 2"] | None = None,
 ) -> DataSet:
     """Reads the motions of an arm with all their samples; see `read_recording` for the arguments.
 
-    An episode that would have to be repaired, such as one in which a joint jumps, has a fault.
+    An episode that would have to be repaired, such as one in which a joint jumps, has a fault. Angles beyond the
+    arm's own range are noted alone, since zeros of real arms are not quite those of their models.
 
     Raises:
       ValueError: what `read_recording` rejects; all episodes have faults.
     """
     names = source_names(arm, joints)
     recording = read_source(path, names, topic, rate)
-    ranges = np.asarray(arm.joint_range, float)
+    ranges = np.asarray(arm.joint_range if joint_range is None else joint_range, float)
     unit, line = find_unit(str(path), recording, arm.joint_names, ranges, units)
     entry = recording.entry
     recordings = {entry: recording} | {name: read_source(path, names, name, rate) for name in recording.commanded}
     joint_names = {name: found.joints for name, found in recordings.items()}
-    motions, faults = _whole(in_rad(recording, unit, ranges), arm, ranges)
+    motions, faults = _whole(in_rad(recording, unit, ranges), arm)
     if not motions:
         raise ValueError(next(iter(faults.values())))
     every = {entry: motions}
     for name in recording.commanded:
         found = in_rad(recordings[name], unit, ranges).motions
         every[name] = {episode: _near(found[episode], motion) for episode, motion in motions.items()}
-    notes = tuple(note for note in (*recording.notes, line) if note)
+    notes = tuple(note for note in (*recording.notes, line, _beyond(motions, arm.joint_names, ranges)) if note)
     return DataSet(path, entry, every, joint_names, faults, recording.gripper, unit, rate is None, notes)
 
 
-def _whole(recording: Recording, arm: Embodiment, ranges: np.ndarray) -> tuple[dict[str, Motion], dict[str, str]]:
+def _whole(recording: Recording, arm: Embodiment) -> tuple[dict[str, Motion], dict[str, str]]:
     """The motions that need no repair, with angles within the range, and what is wrong with the others."""
-    motions, faults = {}, {}
+    motions, faults, ranges = {}, {}, np.asarray(arm.joint_range, float)
     for name, motion in recording.motions.items():
         notes = Notes()
         try:
@@ -107,6 +109,16 @@ def _whole(recording: Recording, arm: Embodiment, ranges: np.ndarray) -> tuple[d
         else:
             faults[name] = "; ".join(notes.lines())
     return motions, faults
+
+
+def _beyond(motions: Mapping[str, Motion], names: Sequence[str], ranges: np.ndarray) -> str:
+    """A line about the joint that is farthest beyond the arm's own range; empty where none is."""
+    low, high = (extreme([extreme(motion.qpos, axis=0) for motion in motions.values()], axis=0)
+                 for extreme in (np.min, np.max))  # fmt: skip
+    beyond = np.maximum(ranges[:, 0] - low, high - ranges[:, 1])
+    joint = int(np.argmax(beyond))
+    text = f"{names[joint]} is up to {beyond[joint]:.2g} rad beyond the range of the expert's model"
+    return text if beyond[joint] > OVERSHOOT else ""
 
 
 def _near(command: Motion, motion: Motion) -> Motion:

@@ -1,16 +1,22 @@
 """Motions of a learner that resemble those of an expert under a metric, one trajectory at a time."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from mimic.arms.arm import finite_velocity_limit
+from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.config import MetricConfig
+from mimic.retargeting.costs import Costs
 from mimic.retargeting.pose import PoseImitation
 from mimic.retargeting.trajectory import imitate_trajectory
+
+_CHUNK = 256  # times
 
 
 def largest_jump(arm: Embodiment, dt: float) -> Float[np.ndarray, " joints"]:
@@ -43,3 +49,41 @@ def optimal_motions(
 
     # One demonstration after the other: the tracked minima already fill the processor, and memory stays small.
     return jax.jit(lambda all_qpos: jax.lax.map(imitate, all_qpos))(qpos)
+
+
+def retarget_motion(
+    expert: Embodiment,
+    learner: Embodiment,
+    qpos: Float[np.ndarray, "time joints"],
+    metric: MetricConfig,
+    *,
+    hand: str = "exact",
+    base: Sequence[float] | None = None,
+    largest_jump: Float[np.ndarray, " learner_joints"],
+    seed: int = 0,
+    costs: Costs | None = None,
+    capsules: Capsules | None = None,
+) -> Float[np.ndarray, "time learner_joints"]:
+    """The learner's motion [rad] for one of the expert, of any length.
+
+    Args:
+      expert: n joints.
+      learner: n_hat joints.
+      qpos: [T, n] the expert's motion [rad].
+      metric: chooses among the postures, or the motion with hand="scaled".
+      hand: "exact" or "near" for the expert's hand in metres, or the nearest one; "scaled" for the metric alone, in
+        chain lengths.
+      base: the learner's base in the expert's base frame, [x, y, z, yaw] [m, rad]; None for the same.
+      largest_jump: maximum change of each joint between two times [rad].
+      seed: of the random initial poses.
+      costs, capsules: see `imitate_trajectory`.
+    """
+    options: dict[str, Any] = {} if hand == "scaled" else {"hand": "exact", "base": base}
+    count = len(qpos)
+    if hand == "scaled":  # padded, so that motions of similar lengths share what is compiled
+        qpos = qpos[np.minimum(np.arange(-(-count // _CHUNK) * _CHUNK), count - 1)]
+    solution = imitate_trajectory(
+        expert, learner, jnp.asarray(qpos, jnp.float32), largest_jump=largest_jump, key=jax.random.key(seed),
+        costs=costs, capsules=capsules, **metric.build(expert, learner).arguments, **options,
+    )  # fmt: skip
+    return np.asarray(solution.qpos, float)[:count]

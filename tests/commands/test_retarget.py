@@ -1,6 +1,7 @@
 """`python -m mimic.retarget`: motions that keep the velocity limits of the learner, and what is rejected."""
 
 import dataclasses
+import json
 
 import jax
 import numpy as np
@@ -53,7 +54,12 @@ def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows(with_ma
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["env=planar4dof"], "demonstrations: expected a file"),
+        (["env=planar4dof"], "expected a data set or a file of demonstrations"),
+        (["source=none.csv", "demonstrations={recorded}"], "source: expected neither demonstrations= nor mapper="),
+        (["source=none.csv", "hand=firm"], "hand: expected one of exact, near, scaled"),
+        (["source=none.csv", "base=[1,2]"], "base: expected same, auto or [x,y,z,yaw], got [1, 2]"),
+        (["source=none.csv", "failing=maybe"], "failing: expected one of left_out, kept"),
+        (["source=none.csv", "out=new"], "source: no file at 'none.csv'"),
         (["demonstrations={recorded}", "env=planar4dof"], "out: expected a file"),
         (["demonstrations={recorded}", "learner=panda4dof", "out=new.npz"], "recorded with the joints"),
         (
@@ -69,4 +75,26 @@ def test_bad_input(reason, recorded, arguments, message):
 
 
 def test_bad_input_of_the_command(rejected):
-    assert "demonstrations: expected a file" in rejected("retarget", "env=planar4dof")
+    assert "expected a data set or a file of demonstrations" in rejected("retarget", "env=planar4dof")
+
+
+@pytest.mark.slow
+def test_a_data_set_of_one_arm_becomes_one_of_another(tmp_path):
+    """The learner has the expert's links but other names: what is written are the expert's motions."""
+    time = np.arange(0, 3, 0.05)
+    qpos = 0.4 * np.sin(time[:, None] + np.arange(7)) + [0, 0, 0, -1.5, 0, 1.5, 0]
+    rows = np.column_stack([time, qpos, np.linspace(0, 1, len(time))])
+    header = ",".join(["time", *mimic.panda().joint_names, "gripper"])
+    np.savetxt(tmp_path / "in.csv", rows, delimiter=",", header=header, comments="")
+    out = tmp_path / "out"
+    printed = run("retarget", f"source={tmp_path}/in.csv", "learner=panda", "hand=scaled", f"out={out}")
+    assert "episodes: 1 of 1 are written" in printed
+    assert "gripper, as in the source: gripper" in printed
+    written = np.genfromtxt(out / "in.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(written["gripper"], rows[:, -1], atol=1e-9)
+    report = json.loads((out / "report.json").read_text())
+    assert report["episodes"][0]["written"]
+    assert report["episodes"][0]["frames"] == len(time)
+    assert (out / "certificate.png").stat().st_size > 10_000
+    found = np.stack([written[name] for name in mimic.panda().joint_names[:6]], axis=1)
+    np.testing.assert_allclose(found, qpos[:, :6], atol=1e-3)

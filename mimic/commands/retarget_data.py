@@ -1,0 +1,229 @@
+"""Data sets of one arm as data sets of another: what `python -m mimic.retarget source=DATA` does."""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.capsules import Capsules, fit_capsules
+from mimic.arms.embodiment import Embodiment
+from mimic.base.config import new_folder
+from mimic.base.files import write_atomically
+from mimic.commands.certificate_plot import plot_certificates
+from mimic.commands.config import RetargetConfig
+from mimic.metric.config import MetricConfig
+from mimic.motions.formats.episodes import Motion
+from mimic.motions.rewriting import DataSet, read_data_set, write_data_set
+from mimic.retargeting.base_placement import find_base
+from mimic.retargeting.certificate import Certificate, certify
+from mimic.retargeting.motions import largest_jump, retarget_motion
+from mimic.runs.files import finite, written_atomically
+
+_REPORT, _PICTURE = "report.json", "certificate.png"
+_SHOWN = 12  # episodes in the table; those that fail come first
+_POSITION_ALONE = 0.5  # of the frames that fail: with so many whose hand is at its place, the rotation is what fails
+
+
+class _Setting(NamedTuple):
+    """What all episodes of a data set share."""
+
+    expert: Embodiment
+    learner: Embodiment
+    metric: MetricConfig
+    hand: str
+    base: list[float] | None
+    dt: float
+    seed: int
+    costs: Any
+    capsules: Capsules | None
+
+
+def prepare_data_set(config: RetargetConfig) -> Callable[[], int]:
+    """Checks the config and reads the data set; the returned function retargets, certifies and writes it.
+
+    Raises:
+      ValueError: a key without effect, a source that cannot be read, arms without hands, or `out` exists.
+    """
+    out, env = new_folder("out", config.out), config.resolve()
+    expert, learner = env.build_arms().embodiments
+    free = build_arm(dataclasses.replace(env.expert, home=None), config.limits or "none").embodiment
+    for arm in (expert, learner):
+        if not len(arm.hand_joint):
+            raise ValueError(f"hand: expected an arm whose hand is known, got {arm.name}; hand=scaled needs none")
+    data = read_data_set(
+        Path(config.source).expanduser(), free, joints=config.joints, topic=config.topic, units=config.units,
+        rate=config.rate, joint_range=expert.joint_range,
+    )  # fmt: skip
+    dt = float(np.median(np.concatenate([np.diff(motion.time) for motion in data.measured.values()])))
+    setting = _Setting(
+        expert, learner, env.metric, config.hand, config.placement, dt, config.seed, config.costs,
+        _capsules(env.learner, env.limits),
+    )  # fmt: skip
+
+    def run() -> int:
+        console = Console()
+        used = _with_base(setting, config.base, data, console)
+        motions: dict[str, dict[str, Motion]] = {entry: {} for entry in data.motions}
+        certificates = {}
+        for number, name in enumerate(data.measured, start=1):
+            with console.status(f"retargeting {name}, {number} of {len(data.measured)}, to {learner.name}"):
+                found, certificates[name] = retarget_episode(data, name, used)
+            for entry, motion in found.items():
+                motions[entry][name] = motion
+        kept = [name for name, item in certificates.items() if item.is_ok or config.failing == "kept"]
+        if not kept:
+            _print(console, data, certificates, kept, used, ())
+            print("error: no episode to write; failing=kept writes those that fail too", file=sys.stderr)
+            return 1
+        with written_atomically(out) as folder:
+            lines = write_data_set(data, folder, learner, motions, kept, np.asarray(learner.joint_range, float))
+            report = _report(data, certificates, kept, used, config)
+            write_atomically(folder / _REPORT, json.dumps(finite(report), indent=2) + "\n")
+            plot_certificates(certificates, dt, folder / _PICTURE, f"{expert.name} to {learner.name}, {data.path.name}")
+        _print(console, data, certificates, kept, used, lines)
+        console.print(f"results: {out}", soft_wrap=True, highlight=False)
+        return 0
+
+    return run
+
+
+def retarget_episode(data: DataSet, name: str, setting: _Setting) -> tuple[dict[str, Motion], Certificate]:
+    """The learner's motions of an episode by entry, and the certificate of the measured one.
+
+    Commands are retargeted with the measured motion, as one path there and back, so that both have one posture and
+    the lag between them stays.
+    """
+    measured = data.measured[name]
+    count, jump = len(measured.time), largest_jump(setting.learner, setting.dt)
+    parts = [motions[name].qpos[:: (-1) ** index] for index, motions in enumerate(data.motions.values())]
+    path = retarget_motion(
+        setting.expert, setting.learner, np.concatenate(parts), setting.metric, hand=setting.hand, base=setting.base,
+        largest_jump=jump, seed=setting.seed, costs=setting.costs, capsules=setting.capsules,
+    )  # fmt: skip
+    found = {}
+    for index, entry in enumerate(data.motions):
+        qpos = path[index * count : (index + 1) * count][:: (-1) ** index]
+        qvel = np.gradient(qpos, measured.time, axis=0)
+        found[entry] = Motion(measured.time, qpos, qvel, measured.gripper)
+    certificate = certify(
+        setting.expert, setting.learner, measured.qpos, found[data.entry].qpos, jump,
+        base=setting.base, capsules=setting.capsules, demands_hand=setting.hand == "exact",
+    )  # fmt: skip
+    return found, certificate
+
+
+def _capsules(arm: ArmConfig, limits: str) -> Capsules | None:
+    """Capsules around the links of an arm; None where it has no shapes."""
+    try:
+        return fit_capsules(arm, limits)
+    except ValueError:
+        return None
+
+
+def _with_base(setting: _Setting, base: Any, data: DataSet, console: Console) -> _Setting:
+    """The setting with the placement that is found for the data set, with base=auto."""
+    if base != "auto":
+        return setting
+    arguments = setting.metric.build(setting.expert, setting.learner).arguments
+    paths = [motion.qpos for motion in data.measured.values()]
+    with console.status("placing the base"):
+        found = find_base(
+            setting.expert, setting.learner, paths, largest_jump=largest_jump(setting.learner, setting.dt), **arguments
+        )
+    return setting._replace(base=[round(float(number), 4) for number in found])
+
+
+def _report(
+    data: DataSet,
+    certificates: Mapping[str, Certificate],
+    kept: Sequence[str],
+    setting: _Setting,
+    config: RetargetConfig,
+) -> dict[str, Any]:
+    rows = [{"episode": name, "written": name in kept, **item.summary()} for name, item in certificates.items()]
+    return {
+        "source": str(data.path),
+        "expert": setting.expert.name,
+        "learner": setting.learner.name,
+        "hand": setting.hand,
+        "base": setting.base or [0.0, 0.0, 0.0, 0.0],
+        "units": data.unit,
+        "measured": data.entry,
+        "commanded": list(data.commands),
+        "gripper": list(data.gripper),
+        "failing": config.failing,
+        "episodes": rows,
+        "not_retargeted": dict(data.faults),
+    }
+
+
+def _print(
+    console: Console,
+    data: DataSet,
+    certificates: Mapping[str, Certificate],
+    kept: Sequence[str],
+    setting: _Setting,
+    written: Sequence[str],
+) -> None:
+    """Prints the certificates, those that fail first, and lines about what was assumed, written and left out."""
+    title = f"{data.path.name}: {setting.expert.name} to {setting.learner.name}, hand={setting.hand}"
+    table = Table(title=title, title_justify="left")
+    for header in ("episode", "exact frames", "hand [mm]", "[deg]", "margin [deg]", "speed", "clearance [mm]"):
+        table.add_column(escape(header), justify="left" if header == "episode" else "right")
+    names = sorted(certificates, key=lambda name: certificates[name].is_ok)
+    for name in names[:_SHOWN]:
+        item = certificates[name]
+        clearance = item.clearance.min()
+        table.add_row(
+            name,
+            f"{item.is_exact.sum()} of {len(item.causes)}",
+            f"{1e3 * item.position.max():.2f}",
+            f"{np.degrees(item.rotation.max()):.2f}",
+            f"{np.degrees(item.margin.min()):.1f}",
+            f"{item.speed.max():.0%}",
+            "-" if np.isnan(clearance) else f"{1e3 * clearance:.0f}",
+        )
+    console.print(table)
+    lines = [f"episodes: {len(kept)} of {len(certificates) + len(data.faults)} are written"]
+    lines += [f"{len(names) - _SHOWN} more episodes in {_REPORT}"] if len(names) > _SHOWN else []
+    for name in [name for name in names if not certificates[name].is_ok][:_SHOWN]:
+        runs = list(certificates[name].failures())
+        first, last, cause = max(runs, key=lambda run: run[1] - run[0])
+        more = f", and {len(runs) - 1} more times" if len(runs) > 1 else ""
+        lines.append(f"{name} fails: {cause}, frames {first} to {last}{more}")
+    lines += [f"not retargeted: {name}: {fault}" for name, fault in list(data.faults.items())[:_SHOWN]]
+    base = setting.base or [0.0, 0.0, 0.0, 0.0]
+    lines.append(f"base of {setting.learner.name} in that of {setting.expert.name} [m, rad]: {base}")
+    lines += [*data.notes, f"commands: {', '.join(data.commands) or 'none'}"]
+    lines.append(f"gripper, as in the source: {', '.join(data.gripper)}" if data.gripper else "gripper: none")
+    for line in [*lines, *written, *filter(None, [_help_line(certificates, setting)])]:
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+def _help_line(certificates: Mapping[str, Certificate], setting: _Setting) -> str:
+    """What would help the episodes that fail; empty where none does."""
+    failing = [item for item in certificates.values() if not item.is_ok]
+    if not failing:
+        return ""
+    causes = " ".join(cause for item in failing for cause in item.causes)
+    wrong = [item.position[np.array([bool(cause) for cause in item.causes])] for item in failing]
+    advice = []
+    if "velocity limit" in causes:
+        advice.append("a slower source (velocity limits)")
+    if "out of reach" in causes or "range" in causes:
+        advice.append("another base (base=auto)" if setting.base is None else "another base (base=[x,y,z,yaw])")
+    if np.mean(np.concatenate(wrong) < 1e-3) > _POSITION_ALONE:
+        advice.append("the hand's position alone")
+    if "touch" in causes:
+        advice.append("a cost of touching (costs.self_collision=0.1)")
+    if "hand" in causes:
+        advice.append("hand=near, which takes the nearest hand")
+    return f"what would help: {'; '.join(advice)}" if advice else ""
