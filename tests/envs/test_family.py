@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import pytest
 
 import mimic
@@ -11,7 +10,6 @@ from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import panda_path
 from mimic.envs.family import SEEN, UNSEEN, arm_name, arm_sampler, report_arms
 from mimic.envs.many_arms import AnyArmEnv
-from mimic.envs.wrappers import wrap_for_training
 from tests.helpers.untrained_run import family
 
 FAMILIES = "panda_family", "any_arm"
@@ -28,15 +26,6 @@ def test_make_returns_the_environment_of_any_arm(name):
 def test_registered_environments_of_many_arms_are_made_too(own_registry):
     mimic.register("environment", "few", {"expert": "panda", "arms": {"locked_fraction": 1.0, "most_locked": 0}})
     assert isinstance(mimic.make("few", **SMALL), AnyArmEnv)
-
-
-@pytest.mark.slow
-def test_brax_wraps_it_for_training():
-    env = mimic.make("panda_family", **SMALL)
-    wrapped = wrap_for_training(env, 6)
-    state = jax.eval_shape(wrapped.reset, jax.random.split(jax.random.PRNGKey(0), 3))
-    after = jax.eval_shape(wrapped.step, state, jnp.zeros((3, env.action_size)))
-    assert after.obs.shape == state.obs.shape == (3, env.observation_size)
 
 
 def test_the_report_has_each_arm_once():

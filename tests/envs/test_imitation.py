@@ -21,7 +21,6 @@ def planar_env():
 
 
 OF_MANY_ARMS = ("any_arm", "panda_family")
-OF_ONE_LEARNER = [name for name in mimic.environments() if name not in OF_MANY_ARMS]
 QUICK = ("planar4dof", "panda3dof")  # the others have all their shapes checked
 
 
@@ -38,7 +37,7 @@ def test_every_environment_has_its_shapes(name):
 @pytest.mark.slow_for("planar4dof-none")
 @pytest.mark.parametrize("limits", ["none", "hardware"])
 @pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in OF_ONE_LEARNER]
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in mimic.environments()]
 )
 def test_every_environment_resets_and_steps(name, limits):
     # MJX takes longest to compile; other tests hold each arm's motion under it against MuJoCo's.
@@ -46,20 +45,11 @@ def test_every_environment_resets_and_steps(name, limits):
     env = mimic.make(name, demonstrations=FEW, limits=limits, physics=physics)
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     after = jax.jit(env.step)(state, jnp.zeros(env.action_size))
-    assert after.reward == pytest.approx(-float(after.metrics["distance"]))  # at rest at home, far from any limit
     assert np.all(np.isfinite(after.obs)) and not after.done
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("limits", ["none", "hardware"])
-@pytest.mark.parametrize("name", OF_MANY_ARMS)
-def test_every_environment_of_many_arms_resets_and_steps(name, limits):
-    env = mimic.make(name, demonstrations=FEW, limits=limits)
-    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
-    after = jax.jit(env.step)(state, jnp.zeros(env.action_size))
-    assert after.reward == 0  # the reward is relative to the zero action
-    assert 0 < after.metrics["distance"] < 1.1 * after.pipeline_state.hold
-    assert np.all(np.isfinite(after.obs)) and not after.done
+    if name in OF_MANY_ARMS:  # the reward is relative to the zero action
+        assert after.reward == 0 < after.metrics["distance"] < 1.1 * after.pipeline_state.hold
+    else:  # at rest at home, far from any limit
+        assert after.reward == pytest.approx(-float(after.metrics["distance"]))
 
 
 def test_the_default_physics_is_resolved_and_can_be_replaced(planar_env):
