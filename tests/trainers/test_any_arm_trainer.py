@@ -11,7 +11,7 @@ from mimic.commands.fit import Run
 from mimic.envs.family import arms_config
 from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.make import make_trainer
+from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.ppo.trainer import EVALUATED_DEMONSTRATIONS
 from mimic.trainers.run_config import load_config
 from tests.helpers.commands import command
@@ -42,10 +42,15 @@ ROW = {"seen", "joints", "gap", "controller_gap", "mean_distance", "lower_bound"
 
 
 @pytest.fixture(scope="module")
-def trainer():
+def config():
     env = family()
     env = dataclasses.replace(env, demonstrations=dataclasses.replace(env.demonstrations, held_out=12))
-    return make_trainer(TrainConfig(env, PPOConfig(hidden_layers=[8], preset="cpu", crossovers=4)), None)
+    return TrainConfig(env, PPOConfig(hidden_layers=[8], preset="cpu", crossovers=4)).resolve()
+
+
+@pytest.fixture(scope="module")
+def trainer(config):
+    return make_ppo_trainer(config, None)
 
 
 def test_it_evaluates_the_arms_of_the_report(trainer):
@@ -54,6 +59,11 @@ def test_it_evaluates_the_arms_of_the_report(trainer):
     assert trainer.env_config.physics == "fused" and trainer.columns == ("seen arms", "unseen arms")
     assert trainer._env.demonstrations.count == COUNT + 4 and trainer._demonstrations.count == COUNT + 12
     assert trainer.evaluator.env.demonstrations.count == EVALUATED_DEMONSTRATIONS
+
+
+def test_other_demonstrations_keep_their_length(config, trainer):
+    longer = make_ppo_trainer(config, None, trainer._demonstrations.of_length(7)).evaluator.env
+    assert longer.config.horizon == 7 and longer.demonstrations.count == EVALUATED_DEMONSTRATIONS
 
 
 def metrics_of(gap):
