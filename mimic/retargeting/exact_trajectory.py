@@ -83,8 +83,11 @@ def exact_trajectory(
 
 
 def in_chunks(rows: np.ndarray, size: int, overlap: int = 0) -> Iterator[np.ndarray]:
-    """The rows in chunks of one size; the last one is padded with its last row."""
-    for start in range(0, max(len(rows) - overlap, 1), size - overlap):
+    """The rows in chunks of one size, each with the first rows of the next; the last one is padded with its last row.
+
+    Each row is among the first `size - overlap` of a chunk.
+    """
+    for start in range(0, len(rows), size - overlap):
         chunk = rows[start : start + size]
         yield np.concatenate([chunk, np.repeat(chunk[-1:], size - len(chunk), axis=0)])
 

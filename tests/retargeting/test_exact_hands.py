@@ -12,7 +12,7 @@ from mimic.metric.config import MetricConfig
 from mimic.metric.distance import embodiment_distance
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.base_placement import find_base
-from mimic.retargeting.exact_trajectory import Candidates, best_path, within_ranges
+from mimic.retargeting.exact_trajectory import Candidates, best_path, in_chunks, within_ranges
 from mimic.retargeting.hand_target import (
     POSITION_TOLERANCE,
     ROTATION_TOLERANCE,
@@ -273,3 +273,12 @@ def test_a_base_is_found_from_which_a_small_arm_follows():
         for b in (None, base)
     ]
     assert exact[0] < 0.5 and exact[1] == 1
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 5, 8, 9])
+def test_each_time_is_in_a_chunk(count):
+    """Chunks of four times, which need the next one: the time after a whole number of chunks is one of its own."""
+    rows = np.arange(count)
+    chunks = list(in_chunks(rows, 5, overlap=1))
+    assert all(len(chunk) == 5 for chunk in chunks)
+    np.testing.assert_array_equal(np.concatenate([chunk[:4] for chunk in chunks])[:count], rows)
