@@ -19,7 +19,7 @@ _FRAMES, _BASES, _ROUNDS = 16, 64, 3  # frames that judge a base, bases in each 
 _SPREAD = np.array([0.5, 0.5, 0.2, np.pi])  # of the first round: chain lengths of the expert, and rad
 _NARROWER = 0.35  # factor of the spread from one round to the next
 _BEST, _CHECKED = 4, 3  # bases that the next round starts from, and those that are checked on whole motions
-_ROOM, _DISTANCE = 0.2, 0.1  # of the score: room in the joint ranges and embodiment distance; an exact hand has 1
+_ROOM, _DISTANCE = 0.2, 0.3  # of the score: room in the joint ranges and embodiment distance; an exact hand has 1
 
 
 def find_base(
