@@ -1,7 +1,6 @@
 """Where the base of an arm stands so that its hand reaches what the expert's reaches."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -18,7 +17,7 @@ from mimic.retargeting.trajectory import imitate_trajectory
 _FRAMES, _BASES, _ROUNDS = 16, 64, 3  # frames that judge a base, bases in each round of the search, and rounds
 _SPREAD = np.array([0.5, 0.5, 0.2, np.pi])  # of the first round: chain lengths of the expert, and rad
 _NARROWER = 0.35  # factor of the spread from one round to the next
-_BEST, _CHECKED = 4, 3  # bases that the next round starts from, and those that are checked on whole motions
+_BEST = 8  # bases that the next round starts from, and that are checked on a whole motion at the end
 _ROOM, _DISTANCE = 0.2, 0.3  # of the score: room in the joint ranges and embodiment distance; an exact hand has 1
 
 
@@ -34,8 +33,8 @@ def find_base(
 ) -> Float[np.ndarray, "4"]:
     """The base [x, y, z, yaw] of the learner from which most hands are exact, with room in the joint ranges.
 
-    A random search that narrows in three rounds judges bases by frames of all motions. The best ones are then compared
-    on the longest motion, within `largest_jump`.
+    A random search that narrows in three rounds judges bases by frames of all motions. Of the best ones the first
+    is taken from which the whole longest motion is exact, within `largest_jump`, or else the most of it.
 
     Args:
       expert: n joints.
@@ -66,15 +65,16 @@ def find_base(
         bases, scores = np.concatenate([bases, new]), np.concatenate([scores, of_new])
         order = np.argsort(-scores, kind="stable")[:_BEST]
         bases, scores, spread = bases[order], scores[order], spread * _NARROWER
-    longest = max(paths, key=len)
-
-    def of_motion(base: np.ndarray) -> tuple[float, float]:
-        options: dict[str, Any] = {"hand": "exact", "base": base, "largest_jump": largest_jump}
-        motion = imitate_trajectory(expert, learner, longest, correspondence, weights, **options)
+    longest, best, options = max(paths, key=len), (-1.0, bases[0]), {"hand": "exact", "largest_jump": largest_jump}
+    for base in bases:
+        motion = imitate_trajectory(expert, learner, longest, correspondence, weights, base=base, **options)
         assert motion.hand is not None
-        return float(motion.hand.exact.mean()), -float(motion.distance.mean())
-
-    return max(bases[:_CHECKED], key=of_motion)
+        exact = float(motion.hand.exact.mean())
+        if exact > best[0]:
+            best = exact, base
+        if exact == 1:
+            break
+    return best[1]
 
 
 def _scores(

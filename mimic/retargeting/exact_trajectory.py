@@ -37,6 +37,7 @@ _LEAP = 1.001  # of the maximum change: a path that changes by more passes to an
 _INEXACT = 10.0  # distance that an exact hand is worth, at each time
 _PER_METRE = 1e3  # of the error of a hand that is not exact
 _PER_STEP = 1.0  # distance that a step on the way to another branch costs, of arms that stay exact meanwhile
+_FRACTIONS = 1.0, 0.5, 0.0  # of the way to the path in a step
 _POSITION_FIRST = 1e-3  # weight of the rotation of a hand that is not exact
 
 
@@ -68,15 +69,23 @@ def exact_trajectory(
     tracked = _candidates(*arms)
     chunks = [tracked(x, base, random, jump) for x in in_chunks(poses, CHUNK + 1, 1)]
     candidates = Candidates(*(np.concatenate(jax.device_get(part))[:times] for part in zip(*chunks, strict=True)))
+    continuous, ranges = continuous_joints(learner), np.asarray(learner.joint_range)
+    report = _report(*arms)
+
+    def realized(cost_of_step: float) -> tuple[np.ndarray, ...]:
+        """Angles, distances and errors of the hand on the best path, as fast as it can be followed."""
+        qpos = within_ranges(best_path(candidates, jump, continuous, cost_of_step), ranges)
+        if np.any(np.abs(np.diff(qpos, axis=0)) > jump):
+            qpos = _followed(arms, poses, qpos, base, jump)
+        return qpos, *_by_chunks(lambda x, qpos: report(x, base, qpos), poses, qpos)
+
+    # Whether a redundant arm stays exact on the way to another branch is only known when it goes there.
     is_redundant = learner.num_joints > 6 * len(learner.hand_joint)
-    path = best_path(candidates, jump, continuous_joints(learner), _PER_STEP if is_redundant else _INEXACT)
-    qpos = within_ranges(path, np.asarray(learner.joint_range))
-    if np.any(np.abs(np.diff(qpos, axis=0)) > jump):
-        qpos = _followed(arms, poses, qpos, base, jump, is_redundant)
-    distance, position, rotation = _by_chunks(lambda x, qpos: _report(*arms)(x, base, qpos), poses, qpos)
-    lower, upper = np.asarray(learner.joint_range).T
+    paths = [realized(cost) for cost in ((_PER_STEP, _INEXACT) if is_redundant else (_INEXACT,))]
+    qpos, distance, position, rotation = max(paths, key=lambda path: (is_exact(*path[2:]).sum(), -path[1].mean()))
+    lower, upper = ranges.T
     endless = upper - lower < 2 * np.pi + 1e-4  # of a full revolution and no more: without limits
-    inside = (qpos >= lower - 1e-6) & (qpos <= upper + 1e-6) | (continuous_joints(learner) & endless)
+    inside = (qpos >= lower - 1e-6) & (qpos <= upper + 1e-6) | (continuous & endless)
     qpos, distance, position, rotation = map(jnp.asarray, (qpos, distance, position, rotation))
     exact = is_exact(position, rotation) & inside.all(axis=-1)
     return PoseImitation(qpos, distance, exact, HandError(position, rotation, exact))
@@ -192,15 +201,10 @@ def _report(*arms: Any) -> Callable[..., tuple[Array, Array, Array]]:
 
 
 def _followed(
-    arms: tuple[Any, ...],
-    poses: np.ndarray,
-    path: np.ndarray,
-    base: Placement,
-    jump: np.ndarray,
-    is_redundant: bool,
+    arms: tuple[Any, ...], poses: np.ndarray, path: np.ndarray, base: Placement, jump: np.ndarray
 ) -> np.ndarray:
     """A path as fast as the maximum change allows."""
-    follow, last, chunks = _follower(is_redundant, *arms), path[0].astype(np.float32), []
+    follow, last, chunks = _follower(*arms), path[0].astype(np.float32), []
     for of_expert, of_path in zip(in_chunks(poses, CHUNK), in_chunks(path, CHUNK), strict=True):
         chunks.append(np.asarray(follow(of_expert, base, of_path, last, jump)))
         last = chunks[-1][-1]
@@ -208,10 +212,15 @@ def _followed(
 
 
 @compiled_once
-def _follower(is_redundant: bool, *arms: Any) -> Callable[..., Array]:
-    """The function from CHUNK poses, a placement, a path, the angles before it and the maximum change to angles."""
+def _follower(*arms: Any) -> Callable[..., Array]:
+    """The function from CHUNK poses, a placement, a path, the angles before it and the maximum change to angles.
+
+    Each time is solved from three fractions of the way to the path; of those with an exact hand the farthest is taken.
+    An arm that is not redundant has none of these on its way to another branch and goes straight.
+    """
     solver = exact_solver(*arms)
     lower, upper = pose_limits(solver.learner, np.float32)
+    is_redundant = solver.learner.num_joints > 6 * len(solver.pairs)
 
     def chunk(poses: Array, base: Placement, path: Array, last: Array, jump: Array) -> Array:
         targets, _ = solver.targets(base, poses)
@@ -220,7 +229,7 @@ def _follower(is_redundant: bool, *arms: Any) -> Callable[..., Array]:
 
         def follow(last: Array, now: tuple[ExactTargets, Array, Array]) -> tuple[Array, Array]:
             target, goal, exact = now
-            box = jnp.maximum(lower, last - jump), jnp.minimum(upper, last + jump)
+            box = jnp.maximum(lower, last - jump)[:, None], jnp.minimum(upper, last + jump)[:, None]
             leaps = jnp.any(jnp.abs(goal - last) > _LEAP * jump)
             weight = jnp.where(exact, 1, _POSITION_FIRST).astype(last.dtype)
 
@@ -228,11 +237,15 @@ def _follower(is_redundant: bool, *arms: Any) -> Callable[..., Array]:
                 return hand_cost_derivatives(solver.learner, solver.pairs[:, 1], target.hands, qpos, weight, store)
 
             goal = jnp.clip(goal, last - jump, last + jump)
-            qpos = newton(derivatives, goal, box, _STEPS, _DAMPING).qpos
+            starts = last[:, None] + (goal - last)[:, None] * np.array(_FRACTIONS, last.dtype)
+            lanes = newton(derivatives, starts, box, _STEPS, _DAMPING).qpos
+            position, rotation = solver.errors(target, lanes[..., None])
+            order = jnp.where(is_exact(position, rotation), 0, 1 + _PER_METRE * position + rotation)
+            qpos = lanes[:, jnp.argmin(order)]
             qpos = qpos if is_redundant else jnp.where(leaps, goal, qpos)
             return qpos, qpos
 
-        of_times = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), targets)
+        of_times = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0)[..., None], targets)
         return jax.lax.scan(follow, last, (of_times, path, exact))[1]
 
     return chunk

@@ -249,6 +249,6 @@ def hand_error(target: HandTarget, hand: HandTarget) -> tuple[Array, Array]:
     return distance.max(axis=0), angle.max(axis=0)
 
 
-def is_exact(distance: Array, angle: Array) -> Array:
-    """Whether hands are within the tolerances."""
+def is_exact(distance: Any, angle: Any) -> Any:
+    """Whether hands are within the tolerances; by NumPy for NumPy's arrays."""
     return (distance <= POSITION_TOLERANCE) & (angle <= ROTATION_TOLERANCE)
