@@ -31,6 +31,7 @@ from mimic.retargeting.pose import PoseImitation, shared_joints, wrap_angles
 
 SPACING, SEGMENTS = 16, 16  # times from one anchor to the next, and such segments in a chunk
 CHUNK = SPACING * SEGMENTS
+_BRANCHES = 9  # at each anchor
 _STEPS, _DAMPING = 4, 1e-3  # Newton's method from the neighbouring time
 _SLACK = 0.95  # of the maximum change for candidates, which are finished afterwards
 _LEAP = 1.001  # of the maximum change: a path that changes by more passes to another branch
@@ -130,7 +131,7 @@ def _candidates(*arms: Any) -> Callable[..., Candidates]:
     def chunk(poses: Array, base: Placement, random: RandomPoses, jump: Array) -> Candidates:
         targets, states = solver.targets(base, poses)
         first = shared_joints(solver.expert, solver.learner, poses[anchors])
-        branches = solver.branches(at(targets, anchors), first, random, DESCENTS)
+        branches = solver.branches(at(targets, anchors), first, random, DESCENTS._replace(kept=_BRANCHES))
         begin = jnp.concatenate([branches[..., :-1], branches[..., 1:]], axis=-1)
         tracks = track(targets, begin, (_SLACK * jump).astype(poses.dtype)[:, None, None])
         forwards = jnp.concatenate([begin[None, ..., :SEGMENTS], tracks[:-1, ..., :SEGMENTS]])

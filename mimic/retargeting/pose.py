@@ -34,7 +34,7 @@ HANDS = ("free", "exact")
 AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
 ITERATIONS = {"newton": 16, "gradient_descent": 1000}
-STARTS = {"free": 12, "exact": 24}
+STARTS = {"free": 12, "exact": 35}
 FLAT = 1e-3  # gradient [1/rad] of a converged pose, as a fraction of the mean distance of random poses
 
 
@@ -104,7 +104,7 @@ def imitate_pose(
         postures with this hand; `method`, `iterations` and `kept` are of "free", which leaves the hand to the metric.
       base: the learner's base in the expert's base frame, for exact hands: [x, y, z, yaw] [m, rad], or a pose [4, 4];
         None for the same base. Link directions are compared in the same axes, positions each from its own base.
-      starts: number of random initial guesses, 12 where None, 24 for exact hands; with 0 the expert's angles are the
+      starts: number of random initial guesses, 12 where None, 35 for exact hands; with 0 the expert's angles are the
         only one.
       key: of the random poses; `jax.random.key(0)` where None.
       warm_start: [..., n_hat] replaces all initial guesses.
