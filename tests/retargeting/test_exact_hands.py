@@ -249,13 +249,13 @@ def test_a_motion_is_exact_continuous_and_within_limits():
 @pytest.mark.slow
 def test_a_motion_out_of_reach_stays_continuous_and_claims_nothing_there():
     time = np.linspace(0, 6, 300)
-    qpos = np.zeros((300, 7), np.float32) + np.array([0, 0.3, 0, -2.4, 0, 2.1, 0.7])
-    qpos[:, 3] = -2.4 + 1.8 * np.sin(np.pi * time / 6)  # stretches the arm, and bends it again
+    qpos = np.zeros((300, 7), np.float32) + np.array([0, 0.3, 0, -2.6, 0, 2.1, 0.7])
+    qpos[:, 3] = -2.6 + 2.0 * np.sin(np.pi * time / 6)  # stretches the arm, and bends it again
     metric, jump = MetricConfig().build(ARM, ARM), ARM.velocity_limit * (time[1] - time[0])
-    base = [-0.25, 0, 0, 0]
+    base = [-0.2, 0, 0, 0]
     solution = imitate_trajectory(ARM, ARM, qpos, **metric.arguments, hand="exact", base=base, largest_jump=jump)
     exact = np.asarray(solution.hand.exact)
-    assert exact[:20].all() and exact[-20:].all() and not exact[135:165].any()
+    assert exact[:5].all() and exact[-5:].all() and not exact[135:165].any()
     assert np.asarray(solution.hand.position)[135:165].min() > 0.01
     assert np.all(np.abs(np.diff(solution.qpos, axis=0)) <= jump * (1 + 1e-5))
 
