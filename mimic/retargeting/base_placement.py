@@ -17,7 +17,7 @@ from mimic.retargeting.trajectory import imitate_trajectory
 _FRAMES, _BASES, _ROUNDS = 16, 64, 3  # frames that judge a base, bases in each round of the search, and rounds
 _SPREAD = np.array([0.5, 0.5, 0.2, np.pi])  # of the first round: chain lengths of the expert, and rad
 _NARROWER = 0.35  # factor of the spread from one round to the next
-_BEST = 8  # bases that the next round starts from, and that are checked on a whole motion at the end
+_BEST = 4  # bases that the next round starts from, and that are checked on a whole motion at the end
 _ROOM, _DISTANCE = 0.2, 0.3  # of the score: room in the joint ranges and embodiment distance; an exact hand has 1
 
 
