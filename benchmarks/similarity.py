@@ -1,9 +1,10 @@
 """Similarity of the learner to the expert at the optimum of each candidate metric, by measures that nothing optimises.
 
-    python -m benchmarks.similarity --out FILE [--arms FOLDER] [--plot FILE.png] [--pair NAME ...]
+    python -m benchmarks.similarity --out FILE [--arms FOLDER] [--plot FILE.png] [--pair NAME ...] [--hands]
 
 The learner takes the pose of minimum distance under each candidate metric (links kept or merged, correspondence,
-translation weight; the rotation weight is 1); baselines are those of `mimic.retargeting.pose_baselines`. FOLDER holds
+translation weight; the rotation weight is 1); with --hands under the default metric with each weight of the hand's
+rotation. Baselines are those of `mimic.retargeting.pose_baselines`. FOLDER holds
 an unpacked wheel of robosuite, for arms other than the Panda. Each pair, links and correspondence compiles for 10 s.
 """
 
@@ -33,6 +34,7 @@ SOME_TRANSLATIONS = 0.0, 0.5, 2.0
 KEPT = {("kept", name): TRANSLATIONS for name in ("arc_length", "overlap")}  # candidates
 MERGED = {("merged", name): SOME_TRANSLATIONS for name in ("overlap", "arc_length")}
 STATE_DEPENDENT = {("kept", name): SOME_TRANSLATIONS for name in ("hard", "soft")}
+HANDS = 0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.3  # weights of the hand's rotation
 SUBSET = ("panda -3,6,7", "panda -5")  # of state-dependent correspondence, which is slow
 EVERY = 10  # samples of a demonstration of which one is taken
 FULL, FULL_DEMONSTRATIONS = "panda -3,6,7", 40  # the environment panda4dof: on more demonstrations and samples
@@ -88,7 +90,21 @@ def optimal_poses(
         yield f"{links} {correspondence} {translation:g}", learner, poses
 
 
-def run_pair(pair: EnvConfig, demonstrations: int, random: int) -> list[Row]:
+def with_hands(pair: EnvConfig, qpos: np.ndarray) -> Iterator[tuple[str, mimic.Embodiment, np.ndarray]]:
+    """As `optimal_poses`, for each weight of the hand's rotation."""
+    expert, learner = pair.build_arms().embodiments
+    metric = pair.metric.build(expert, learner)
+
+    @jax.jit
+    def solve(qpos: jax.Array, rotation: jax.Array) -> jax.Array:
+        arguments = metric.arguments | {"hand_weights": mimic.HandWeights(rotation)}
+        return mimic.imitate_pose(expert, learner, qpos, **arguments).qpos
+
+    for weight in HANDS:
+        yield f"hand {weight:g}", learner, np.asarray(solve(jnp.asarray(qpos, jnp.float32), jnp.float32(weight)))
+
+
+def run_pair(pair: EnvConfig, demonstrations: int, random: int, *, hands: bool = False) -> list[Row]:
     expert, learner = pair.build_arms().embodiments
     count, every = (max(FULL_DEMONSTRATIONS, demonstrations), 5) if pair.name == FULL else (demonstrations, EVERY)
     rows: list[Row] = []
@@ -108,6 +124,11 @@ def run_pair(pair: EnvConfig, demonstrations: int, random: int) -> list[Row]:
         if posed is not None:
             add(baseline, kind, learner, posed[:, ::every].reshape(-1, learner.num_joints))
     everything, ends = np.concatenate([*sets.values()]), np.cumsum([len(qpos) for qpos in sets.values()])
+    if hands:
+        for method, arm, poses in with_hands(pair, everything):
+            for kind, part in zip(sets, np.split(poses, ends[:-1]), strict=True):
+                add(method, kind, arm, part)
+        return rows
     candidates = KEPT | (MERGED if pair.learner.locked else {}) | (STATE_DEPENDENT if pair.name in SUBSET else {})
     for (links, correspondence), translations in candidates.items():
         for method, arm, poses in optimal_poses(pair, links, correspondence, translations, everything):
@@ -119,6 +140,7 @@ def run_pair(pair: EnvConfig, demonstrations: int, random: int) -> list[Row]:
 def main() -> None:
     parser = make_parser("similarity", __doc__, plot=Path, demonstrations=20, random=120, arms="robosuite")
     parser.add_argument("--pair", nargs="+", metavar="NAME", help="these pairs alone")
+    parser.add_argument("--hands", action="store_true", help="weights of the hand's rotation in the default metric")
     options = parser.parse_args()
     logging.getLogger("mimic").setLevel(logging.ERROR)
     others, missing = other_arms(Path(options.arms))
@@ -128,13 +150,13 @@ def main() -> None:
     settings = {"demonstrations": options.demonstrations, "every": EVERY, "random": options.random}
     rows: list[Row] = []
     for name in options.pair or pairs:
-        rows += run_pair(pairs[name], options.demonstrations, options.random)
+        rows += run_pair(pairs[name], options.demonstrations, options.random, hands=options.hands)
         print(name, flush=True)
         summary, lines = similarity_front.summarise(rows), similarity_front.to_lines(rows)
         write_results(options, settings=settings, not_found=missing, summary=summary, rows=lines)
     similarity_front.print_tables(rows)
     if options.plot:
-        similarity_front.plot(rows, options.plot)
+        (similarity_front.plot_hands if options.hands else similarity_front.plot)(rows, options.plot)
 
 
 if __name__ == "__main__":

@@ -275,6 +275,17 @@ def metrics_by_arms(results: Results) -> list[Cells]:
     return _candidates(results["summary"]["other arms, demonstrations, to hand_ik"], "hand_ik")
 
 
+def hand_weights(results: Results) -> list[Cells]:
+    groups = {"locks": "Panda with one or two joints locked", "other arms": "the Panda and six other arms"}
+    summaries = [results["summary"][f"{group}, demonstrations, to no weight"] for group in groups]
+    measures = {"centre_line_distance": "centre line", "hand_rotation_deg": "hand rotation"}
+    rows: list[Cells] = [("weight", *(f"{arms}: {name}" for arms in groups.values() for name in measures.values()))]
+    for method in (name for name in summaries[0] if name.startswith("hand 0.")):
+        ratios = [f"{summary[method][measure]['ratio']:.2f}" for summary in summaries for measure in measures]
+        rows.append((method.removeprefix("hand "), *ratios))
+    return rows
+
+
 def default_metric(results: Results) -> list[Cells]:
     cases = {
         "locks, demonstrations, to copy_joints": ("Panda with one or two joints locked", "copying joints"),

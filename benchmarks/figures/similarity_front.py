@@ -15,6 +15,7 @@ FRONT = ("centre_line_distance", "tangent_angle_deg", "hand_position_error", "ha
 SLACK = {"hand_position_error": 1.05}  # multiple of the baseline's value that is no loss; 1 for the others
 # Below these a baseline is exact (a locked last roll joint moves no link): no ratio, and reaching them is no loss.
 EXACT = {name: 0.1 if name.endswith("deg") else 1e-3 for name in MEASURES}
+NO_HAND = "hand 0"  # the default metric without a weight of the hand
 DEMONSTRATIONS = "computed_torque", "reach"
 
 
@@ -40,6 +41,9 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     for poses, sets in {"demonstrations": DEMONSTRATIONS, "random poses": ("random",)}.items():
         others = [row for row in rows if " to " in row["pair"]]
         summary[f"locks, {poses}, to copy_joints"] = compare([*filter(is_lock, rows)], "copy_joints", sets)
+        if any(row.get("method") == NO_HAND for row in rows):
+            summary[f"locks, {poses}, to no weight"] = compare([*filter(is_lock, rows)], NO_HAND, sets)
+            summary[f"other arms, {poses}, to no weight"] = compare(others, NO_HAND, sets)
         summary[f"other arms, {poses}, to hand_ik"] = compare(others, "hand_ik", sets)
     return summary
 
@@ -106,4 +110,31 @@ def plot(rows: Sequence[Row], path: Path) -> None:
     figure.suptitle(
         "28 locked Pandas, computed torque and reach; numbers: translation weight; filled: Pareto front", fontsize=10
     )
+    save(figure, path)
+
+
+def plot_hands(rows: Sequence[Row], path: Path) -> None:
+    """Rotation of the hand against the centre line for each weight, relative to none: the price of the hand."""
+    figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
+    groups = {
+        "28 locked Pandas": [*filter(is_lock, rows)],
+        "Panda and other arms": [r for r in rows if " to " in r["pair"]],
+    }
+    for label, group in groups.items():
+        compared = compare(group, NO_HAND, DEMONSTRATIONS)
+        points = {name: result for name, result in compared.items() if name.startswith("hand ")}
+        values = [
+            [result[name]["ratio"] for name in ("centre_line_distance", "hand_rotation_deg")]
+            for result in points.values()
+        ]
+        if values:
+            axes.plot(*np.transpose(np.array(values, float)), "o-", label=label)
+            for name, point in list(zip(points, values, strict=True))[-4:]:
+                axes.annotate(name.removeprefix("hand "), point, xytext=(5, 5), textcoords="offset points", fontsize=8)
+    axes.axvline(1.05, color="0.6", lw=1, ls="--")
+    axes.set(
+        xlabel="centre line distance, relative to no weight", ylabel="hand rotation, relative to no weight", ylim=0
+    )
+    axes.grid(alpha=0.25)
+    axes.legend(fontsize=9)
     save(figure, path)

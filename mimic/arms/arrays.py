@@ -55,7 +55,7 @@ class ArmArrays:
       link_position: [links, 3] origin of the link in the frame of that joint, or in the base frame [m].
       link_direction: [links, 3] direction of the link in that frame.
       link_length: [links] length [m].
-      hand_joint: index of the last joint that moves the hand, -1 for none.
+      hand_joint: index of the last joint that moves the hand, -1 for none. A hand that is not known is at the base.
       hand_position: [3] origin of the hand frame in the frame of that joint [m].
       hand_rotation: [3, 3] hand frame in the frame of that joint.
     """
@@ -190,7 +190,7 @@ def arm_arrays(
 def _hand_arrays(arm: Embodiment, rotations: np.ndarray, origins: np.ndarray) -> dict[str, Any]:
     """The fields of the hand of `ArmArrays`, from the frames of the joints."""
     if not arm.hand_joint:
-        raise ValueError(f"{arm.name}: expected an arm with a hand, as all arms of files have")
+        return {"hand_joint": np.asarray(-1, np.int32), "hand_position": np.zeros(3), "hand_rotation": np.eye(3)}
     joint = arm.hand_joint[0]
     rotation, origin = (rotations[joint], origins[joint]) if joint >= 0 else (np.eye(3), np.zeros(3))
     return {

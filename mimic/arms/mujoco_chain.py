@@ -15,6 +15,7 @@ from mimic.arms.kinematic_tree import ChainIds, Tip, find_chain
 from mimic.arms.model_tree import is_revolute
 from mimic.arms.tool_frames import find_frame
 
+UNKNOWN_HAND = "unknown_hand"  # custom text of a model whose hand frame nothing states, as of a captured person
 START_POSES = "ready", "home"  # keyframes with the start pose of a model, in order of preference
 
 # As ints: a MuJoCo enum equals a NumPy integer in one order of the operands and not in the other.
@@ -72,6 +73,8 @@ def read_chain(
         has_base = base_segment and (base is not None or chain_ids.base != _WORLD)
         tips = [found.position for found in hands]
         links = (_base_links(joints, paths) if has_base else []) + _anchor_links(joints, paths, tips)
+    if hand is None and any(model.text(i).name == UNKNOWN_HAND for i in range(model.ntext)):
+        hands = ()
     if len(paths) == 1:
         return Chain(tuple(joints), drop_zero_length(links), hands=hands)
     parents = tuple(_parent(joint, paths) for joint in range(len(joints)))

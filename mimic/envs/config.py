@@ -1,7 +1,7 @@
 """The config of an environment. The presets in mimic/conf/env, `make` and the command line set its fields."""
 
 import dataclasses
-from typing import Literal
+from typing import ClassVar, Literal
 
 from mimic.arms.arm import ArmConfig, ArmPair, build_arm
 from mimic.arms.embodiment import LIMITS
@@ -192,7 +192,7 @@ class EnvConfig:
     preview: int = number(1, at_least=0, at_most=100)  # each step adds an expert to the observation
     limit_weight: float = number(1.0, at_least=0.0, at_most=1e6)
     action_scale: float = number(1.0, at_least=1e-3, at_most=1000.0)  # the torque is cut at the torque limit anyway
-    speed_bound: float = number(30.0, at_least=1e-3, at_most=1000.0)  # the fastest joints of robots reach some 30 rad/s
+    speed_bound: ClassVar[float] = 30.0  # the fastest joints of robots reach it
 
     reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
     observation: ObservationConfig = dataclasses.field(default_factory=ObservationConfig)

@@ -54,7 +54,7 @@ class MetricConfig:
 
     Attributes:
       translation, rotation, linear_velocity, angular_velocity: weights; per chain length, rad, and their rates.
-      hand_rotation, hand_position, hand_angular_velocity: weights of the hands, see `HandWeights`; without effect where
+      hand_rotation, hand_position: weights of the hands, see `HandWeights`; without effect where
         the hand of an arm is not known.
       adaptive: replace the weights of translation and rotation by the paper's distance-dependent ones.
       rotation_measure: "cosine" or "angle".
@@ -71,9 +71,8 @@ class MetricConfig:
     rotation: float = number(1.0, at_least=0.0, at_most=1e6)
     linear_velocity: float = number(0.001, at_least=0.0, at_most=1e6)
     angular_velocity: float = number(0.01, at_least=0.0, at_most=1e6)
-    hand_rotation: float = number(0.0, at_least=0.0, at_most=1e6)
+    hand_rotation: float = number(0.02, at_least=0.0, at_most=1e6)
     hand_position: float = number(0.0, at_least=0.0, at_most=1e6)
-    hand_angular_velocity: float = number(0.0, at_least=0.0, at_most=1e6)
     adaptive: bool = False
     rotation_measure: str = "cosine"
     correspondence: str = "arc_length"
@@ -131,11 +130,10 @@ class MetricConfig:
 
     def compared(self, arm: Embodiment) -> Embodiment:
         """The arm with what this metric compares: without hands where they have no weight."""
-        weights = self.hand_rotation, self.hand_position, self.hand_angular_velocity
-        return arm if any(weights) else without_hands(arm)
+        return arm if self.hand_rotation or self.hand_position else without_hands(arm)
 
     def _hand_weights(self, expert: Embodiment, learner: Embodiment) -> HandWeights:
-        weights = HandWeights(self.hand_rotation, self.hand_position, self.hand_angular_velocity)
+        weights = HandWeights(self.hand_rotation, self.hand_position)
         if weights.are_zero or not expert.hand_joint or not learner.hand_joint:
             return NO_HAND
         pairs = matched_chains(expert.chain_names, learner.chain_names, cast(ChainMatch, self.chains))
@@ -167,7 +165,7 @@ def check_metric(config: MetricConfig) -> DistanceWeights:
     """
     weights = config.make_weights()
     expected: dict[str, Any] = {"correspondence": "arc_length", "reduction": "mean", "rotation_measure": "cosine"}
-    expected |= {"links": "kept", "hand_rotation": 0.0, "hand_position": 0.0, "hand_angular_velocity": 0.0}
+    expected |= {"links": "kept", "hand_rotation": 0.0, "hand_position": 0.0}
     different = [f"{key}={getattr(config, key)}" for key, value in expected.items() if getattr(config, key) != value]
     if different or not isinstance(weights, DistanceWeights):
         raise ValueError(

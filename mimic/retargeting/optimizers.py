@@ -146,7 +146,7 @@ def _descent_step(here: Derivatives, free: Scalars, damping: Scalar) -> Scalars:
     unit = 1 / (scale + jnp.finfo(jnp.result_type(here.value)).tiny)
     matrix = [[times(times(free[i], free[j]), here.hessian[i][j] * unit) for j in range(i + 1)] for i in range(joints)]
     for i in range(joints):
-        matrix[i][i] = plus(matrix[i][i] + damping, 1.0 - free[i])
+        matrix[i][i] = plus(matrix[i][i] + damping * jnp.maximum(jnp.abs(matrix[i][i]), 0.01), 1.0 - free[i])
     step = [times(free[i], -here.gradient[i] * unit) for i in range(joints)]
     pivots = []
     for k in range(joints):

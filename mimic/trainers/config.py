@@ -201,7 +201,7 @@ _MAPPER_FIELDS_OF = {
 }
 # Fields of an environment that a mapper does not use: it maps poses and simulates nothing.
 _NOT_OF_MAPPERS = (
-    *("demonstrations", "start", "horizon", "preview", "reward", "observation", "limit_weight", "speed_bound"),
+    *("demonstrations", "start", "horizon", "preview", "reward", "observation", "limit_weight"),
     *("control_dt", "substeps", "physics", "randomization", "action_scale"),
 )
 ATTENTION_HEADS = 4  # of each layer of the network of any arm

@@ -9,6 +9,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from mimic.arms.mujoco_chain import UNKNOWN_HAND
 from mimic.motions.mocap.link_motion import CUTOFF, LinkMotion, motion_states
 
 AXES = ("z", "y", "x")  # of a link's joints in turn, in its zero frame, whose x-axis points along the link
@@ -42,7 +43,8 @@ def ball_chain_xml(motion: LinkMotion, zero: Float[np.ndarray, "links 3 3"]) -> 
         return f"{shapes}{''.join(map(body, motion.children(link)))}</body>\n"
 
     return (
-        f'<mujoco model="{motion.name}">\n<compiler angle="radian"/>\n<option gravity="0 0 0"/>\n<worldbody>\n'
+        f'<mujoco model="{motion.name}">\n<compiler angle="radian"/>\n<option gravity="0 0 0"/>\n'
+        f'<custom><text name="{UNKNOWN_HAND}" data="no marker shows how the hand is rolled"/></custom>\n<worldbody>\n'
         f"{''.join(map(body, motion.children(-1)))}</worldbody>\n</mujoco>\n"
     )
 
