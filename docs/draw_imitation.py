@@ -66,12 +66,11 @@ def _retarget(
     expert: mimic.Embodiment, learner: mimic.Embodiment, motion: Float[np.ndarray, "frames joints"]
 ) -> tuple[Float[np.ndarray, "frames learner_joints"], Float[np.ndarray, " frames"]]:
     """The learner's motion [rad] and its distance."""
-    correspondence = mimic.arc_length_correspondence(expert, learner)
-    weights = mimic.DistanceWeights(translation=1.0, rotation=1.0)
+    metric = mimic.env_config("panda4dof").metric.build(expert, learner).arguments
     jump = np.asarray(learner.velocity_limit) * FRAME / 1000
-    solution = jax.jit(
-        lambda qpos: mimic.imitate_trajectory(expert, learner, qpos, correspondence, weights, largest_jump=jump)
-    )(motion)
+    solution = jax.jit(lambda qpos: mimic.imitate_trajectory(expert, learner, qpos, **metric, largest_jump=jump))(
+        motion
+    )
     return np.asarray(solution.qpos), np.asarray(solution.distance)
 
 

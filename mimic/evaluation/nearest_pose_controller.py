@@ -1,5 +1,6 @@
 """Controllers of one arm that know its model: towards the pose nearest to the next of the expert, or a policy."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -50,7 +51,8 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
     """
     config = env.config
     expert = build_arm(config.expert, config.limits, config.metric.links)
-    weights = check_metric(config.metric)
+    hand_rotation = env.metric.hand_weights.rotation
+    weights = check_metric(dataclasses.replace(config.metric, hand_rotation=0.0))
     if policy is None:
         arrays = arm_arrays(env.arm)
     else:
@@ -71,7 +73,7 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
         qvel, max_torque = (jnp.zeros(MAX_JOINTS).at[places].set(x) for x in (now.qvel, env.torque_scale))
         own_states = env.expert_at(now.demonstration, now.step + 1)
         next_states = jax.tree.map(lambda x: _padded(x, MAX_LINKS), own_states)
-        problem = Problem(arm, weights, jnp.asarray(matrix), next_states, dt)
+        problem = Problem(arm, weights, jnp.asarray(matrix), next_states, dt, hand_rotation)
         goals = next_goals(problem, goals, qpos, random_numbers(now.key, now.step))
         plan = make_plan(arm, qpos, qvel, goals.goal, speed, dt)
         if policy is None:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.metric.distance import DistanceWeights, Metric
+from mimic.metric.hand import HandWeights
 from mimic.metric.kinematics import LinkStates, link_states
 from mimic.retargeting.array_nearest import NearestPose, nearest_pose
 
@@ -42,6 +43,7 @@ class Problem:
       matrix: correspondence of the links.
       expert: link states of the expert at the next step, [slots of links, 3] each.
       control_dt: duration of a step [s].
+      hand_rotation: weight of the hand's rotation.
     """
 
     arm: ArmArrays
@@ -49,15 +51,18 @@ class Problem:
     matrix: Float[Array, "expert links"]
     expert: LinkStates
     control_dt: float
+    hand_rotation: float = 0.0
 
     def nearest(self, qpos: Float[Array, " joints"], steps: int) -> NearestPose:
         """The result of Newton steps from a pose, see `nearest_pose`."""
-        return nearest_pose(self.arm, self.weights, self.matrix, self.expert, qpos, steps)
+        hand = self.hand_rotation
+        return nearest_pose(self.arm, self.weights, self.matrix, self.expert, qpos, steps, hand_rotation=hand)
 
     def distance(self, qpos: Float[Array, " joints"]) -> Float[Array, ""]:
         """Embodiment distance of a pose, without velocities."""
         weights = dataclasses.replace(self.weights, linear_velocity=0.0, angular_velocity=0.0)
-        return Metric(self.matrix, weights)(self.expert, link_states(self.arm, qpos))
+        metric = Metric(self.matrix, weights, hand_weights=HandWeights(self.hand_rotation))
+        return metric(self.expert, link_states(self.arm, qpos))
 
 
 class Goals(NamedTuple):

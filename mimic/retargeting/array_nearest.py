@@ -81,6 +81,7 @@ def pose_quadratic(
     matrix: Float[Array, "expert links"],
     expert: LinkStates,
     qpos: Float[Array, " joints"],
+    hand_rotation: float = 0.0,
 ) -> PoseQuadratic:
     """The metric near a pose.
 
@@ -90,6 +91,7 @@ def pose_quadratic(
       matrix: correspondence of the links.
       expert: link states of the expert.
       qpos: the learner's pose [rad].
+      hand_rotation: weight of the hand's rotation.
     """
     frames = frame_table(arm, qpos)
     states = states_in_frames(arm, frames)
@@ -113,9 +115,25 @@ def pose_quadratic(
     turning = jnp.cross(expert.angular_velocity, expert.direction)
     turned = jnp.sum(turn * turning[:, None], axis=0)
     rate = -jnp.sum(jacobians.position * carried + jacobians.direction * turned, axis=(1, 2))
+    if hand_rotation:
+        of_hand = _hand_quadratic(arm, frames, states, expert, hand_rotation)
+        gradient, hessian, rate = (own + hand for own, hand in zip((gradient, hessian, rate), of_hand, strict=True))
     mean = jnp.trace(hessian) / jnp.maximum(arm.is_free.sum(), 1)
     hessian = hessian + jnp.diag(_DAMPING * mean + 1e-6 + (1 - arm.is_free))
     return PoseQuadratic(gradient, hessian, rate)
+
+
+def _hand_quadratic(
+    arm: ArmArrays, frames: FrameTable, states: LinkStates, expert: LinkStates, weight: float
+) -> PoseQuadratic:
+    """The part of the hand's rotation, the sum of (pi/4) (1 - a . a_hat) over its axes."""
+    assert states.hand is not None and expert.hand is not None
+    moves = (jnp.arange(MAX_JOINTS) <= arm.hand_joint) * arm.is_free
+    jacobian = moves[:, None, None] * jnp.cross(axes_and_origins(frames)[0][:, None], states.hand.axes[None])
+    axes, turning = expert.hand.axes[:3], jnp.cross(expert.hand.angular_velocity[:1], expert.hand.axes[:3])
+    turn = 0.25 * jnp.pi * weight
+    gradient, rate = (-turn * jnp.sum(jacobian * vectors, axis=(1, 2)) for vectors in (axes, turning))
+    return PoseQuadratic(gradient, turn * jnp.sum(jacobian[:, None] * jacobian, axis=(2, 3)), rate)
 
 
 def solve_free(
@@ -134,6 +152,7 @@ def nearest_pose(
     qpos: Float[Array, " joints"],
     steps: int,
     max_step: Float[Array, " joints"] | float = 0.5,
+    hand_rotation: float = 0.0,
 ) -> NearestPose:
     """A local minimum near a pose, within the joints' ranges.
 
@@ -145,12 +164,13 @@ def nearest_pose(
       qpos: pose to start from [rad].
       steps: Newton steps.
       max_step: largest change of a joint in a step [rad].
+      hand_rotation: weight of the hand's rotation.
     """
     lower, upper = arm.angle_limits
 
     def newton(pose: NearestPose, _: None) -> tuple[NearestPose, None]:
         qpos = pose.qpos
-        near = pose_quadratic(arm, weights, matrix, expert, qpos)
+        near = pose_quadratic(arm, weights, matrix, expert, qpos, hand_rotation)
         step = solve_free(near.hessian, -near.gradient, arm.is_free)
         velocity = solve_free(near.hessian, -near.rate, arm.is_free)
         after = jnp.clip(qpos + jnp.clip(step, -max_step, max_step), lower, upper)

@@ -24,7 +24,8 @@ def test_make_returns_the_environment_of_any_arm(name):
 
 
 def test_registered_environments_of_many_arms_are_made_too(own_registry):
-    mimic.register("environment", "few", {"expert": "panda", "arms": {"locked_fraction": 1.0, "most_locked": 0}})
+    arms = {"locked_fraction": 1.0, "most_locked": 0}
+    mimic.register("environment", "few", {"expert": "panda", "arms": arms, "metric": {"hand_rotation": 0.0}})
     assert isinstance(mimic.make("few", **SMALL), AnyArmEnv)
 
 

@@ -71,8 +71,7 @@ def test_reward_and_observation_follow_the_demonstration_step_by_step():
         expert_states(*(np.asarray(x[which, sample], np.float32) for x in (motions.qpos, motions.qvel)))
         for sample in range(7)
     ]
-    metric = env.metric.correspondence, env.metric.weights
-    distance = jax.jit(lambda expert, learner: mimic.embodiment_distance(expert, learner, *metric))
+    distance = jax.jit(lambda expert, learner: mimic.embodiment_distance(expert, learner, **env.metric.arguments))
     actions = np.random.default_rng(0).uniform(-1, 1, (6, env.action_size)).astype(np.float32)
     state, step = jax.jit(lambda key: env.begin(env.start(key, which)))(jax.random.PRNGKey(0)), jax.jit(env.step)
     for i in range(7):

@@ -31,6 +31,7 @@ def config():
         horizon=HORIZON,
         demonstrations={"count": COUNT, "held_out": HELD_OUT},
         arms={"random_fraction": 1.0, "reward": "distance"},
+        metric={"hand_rotation": 0.0},
     )
 
 

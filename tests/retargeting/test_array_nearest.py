@@ -9,6 +9,7 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
 from mimic.metric.correspondence import arc_length_correspondence
 from mimic.metric.distance import DistanceWeights, Metric
+from mimic.metric.hand import HandWeights
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.array_nearest import nearest_pose, pose_quadratic
 
@@ -27,12 +28,13 @@ def motion(seed):
     return jnp.asarray(qpos), jnp.asarray(qvel)
 
 
-def test_the_gradient_is_that_of_the_metric(x64, panda):
+@pytest.mark.parametrize("hand_rotation", [0.0, 0.3])
+def test_the_gradient_is_that_of_the_metric(x64, panda, hand_rotation):
     learner, matrix = lock_joints(panda, LOCKED), arc_length_correspondence(panda, panda)
     expert, qpos = link_states(panda, *motion(0)), motion(1)[0] * learner.is_free
-    metric = Metric(matrix, WEIGHTS)
+    metric = Metric(matrix, WEIGHTS, hand_weights=HandWeights(hand_rotation))
     expected = jax.jit(jax.grad(lambda q: metric(expert, link_states(learner, q))))(qpos) * learner.is_free
-    near = jax.jit(lambda q: pose_quadratic(learner, WEIGHTS, matrix, expert, q))(qpos)
+    near = jax.jit(lambda q: pose_quadratic(learner, WEIGHTS, matrix, expert, q, hand_rotation))(qpos)
     np.testing.assert_allclose(near.gradient, expected, rtol=0, atol=1e-13)  # rounding of a few hundred operations
     np.testing.assert_allclose(near.hessian, near.hessian.T, rtol=0, atol=1e-15)
     assert np.linalg.eigvalsh(near.hessian).min() > 0
