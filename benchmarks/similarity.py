@@ -97,8 +97,8 @@ def with_hands(pair: EnvConfig, qpos: np.ndarray) -> Iterator[tuple[str, mimic.E
 
     @jax.jit
     def solve(qpos: jax.Array, rotation: jax.Array) -> jax.Array:
-        arguments = metric.arguments | {"hand_weights": mimic.HandWeights(rotation)}
-        return mimic.imitate_pose(expert, learner, qpos, **arguments).qpos
+        weighted = dataclasses.replace(metric, hand_weights=mimic.HandWeights(rotation))
+        return mimic.imitate_pose(expert, learner, qpos, **weighted.arguments).qpos
 
     for weight in HANDS:
         yield f"hand {weight:g}", learner, np.asarray(solve(jnp.asarray(qpos, jnp.float32), jnp.float32(weight)))

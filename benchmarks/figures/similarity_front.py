@@ -130,7 +130,9 @@ def plot_hands(rows: Sequence[Row], path: Path) -> None:
         if values:
             axes.plot(*np.transpose(np.array(values, float)), "o-", label=label)
             for name, point in list(zip(points, values, strict=True))[-4:]:
-                axes.annotate(name.removeprefix("hand "), point, xytext=(5, 5), textcoords="offset points", fontsize=8)
+                axes.annotate(
+                    name.removeprefix("hand "), tuple(point), xytext=(5, 5), textcoords="offset points", fontsize=8
+                )
     axes.axvline(1.05, color="0.6", lw=1, ls="--")
     axes.set(
         xlabel="centre line distance, relative to no weight", ylabel="hand rotation, relative to no weight", ylim=0

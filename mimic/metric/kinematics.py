@@ -332,7 +332,7 @@ def _stacked(
     )
     assert links is not None
     hand = None if axes is None else jax.tree.map(stack, _hand_states(axes), is_leaf=lambda x: isinstance(x, tuple))
-    return LinkStates(*map(stack, links), hand)  # pyright: ignore[reportArgumentType]
+    return LinkStates(*map(stack, links), hand=hand)  # pyright: ignore[reportArgumentType]
 
 
 def _in_units(unit: spatial.Scalar, link: LinkVectors) -> LinkVectors:

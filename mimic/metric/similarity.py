@@ -106,8 +106,10 @@ def _sampled(arm: Embodiment, segments: LinkStates, samples: int) -> CentreLine:
         for i, own in enumerate(segment_chains)
     ]
     points, tangents = (numpy.stack([getattr(line, name) for line in lines], -3) for name in ("points", "tangents"))
-    hands = (numpy.stack([getattr(line, f"hand_{name}") for line in lines], -2) for name in ("position", "direction"))
-    return CentreLine(points, tangents, *hands, axes, chains=arm.chain_names)
+    position, direction = (
+        numpy.stack([getattr(line, f"hand_{name}") for line in lines], -2) for name in ("position", "direction")
+    )
+    return CentreLine(points, tangents, position, direction, axes, chains=arm.chain_names)
 
 
 def _check_samples(samples: int) -> None:

@@ -169,7 +169,7 @@ def write_data_set(
     if data.gripper:
         arrays["gripper"] = np.concatenate([data.measured[name].gripper for name in kept])  # type: ignore[misc]
         arrays["gripper_names"] = np.array(data.gripper)
-    np.savez_compressed(out / "motions.npz", **arrays)
+    np.savez_compressed(out / "motions.npz", **arrays)  # pyright: ignore[reportArgumentType]
     return [
         "format: mimic does not write this one again; the motions are in motions.npz, in rad and without other columns"
     ]

@@ -63,8 +63,8 @@ def _replace(episode: Any, label: str, replacement: Replacement) -> Iterator[str
         if entry == STATES and MODEL in episode.group.attrs:
             yield _move_states(episode.group)
             _set(episode.group, _ANGLES, motion.qpos)
-            _set(episode.group, _VELOCITIES, motion.qvel)
-            _set(episode.group, "time", motion.time)
+            _set(episode.group, _VELOCITIES, np.asarray(motion.qvel))
+            _set(episode.group, "time", np.asarray(motion.time))
             if motion.gripper is not None:
                 _set(episode.group, _GRIPPER, motion.gripper)
             continue

@@ -61,8 +61,8 @@ def rewrite_folder_of_tables(source: Path, out: Path, replacement: Replacement) 
     for quantity, path in tables_by_quantity(source).items():
         if quantity == "time":
             _write(out / path.name, read_cells(path).rows)
-        elif quantity in values:
-            _write(out / path.name, [_BLANK.join(f"{number:{_DIGITS}}" for number in row) for row in values[quantity]])
+        elif (rows := values.get(quantity)) is not None:  # type: ignore[call-overload]
+            _write(out / path.name, [_BLANK.join(f"{number:{_DIGITS}}" for number in row) for row in rows])
         else:
             dropped.append(path.name)
     return dropped
@@ -94,7 +94,7 @@ def rewrite_archive(source: Path, out: Path, replacement: Replacement) -> list[s
     if "split_points" in content:
         content["split_points"] = np.cumsum([0, *(len(motion.time) for motion in kept)])
     with open(out / source.name, "wb") as file:
-        np.savez_compressed(file, **content)
+        np.savez_compressed(file, **content)  # pyright: ignore[reportArgumentType]
     return []
 
 

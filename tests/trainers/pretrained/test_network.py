@@ -18,7 +18,7 @@ from mimic.trainers.pretrained.files import PARAMETERS, read_params, write_netwo
 from mimic.trainers.pretrained.network import NETWORKS, TRAINERS, names_of_one_learner, pretrained_names, read_network
 
 MAX_BYTES = 5_000_000  # of all of them: the package stays small
-OBSERVATION = 12 * (7 + 7 + 4)  # of planar4dof: four vectors for each link; expert now and next, learner
+OBSERVATION = 12 * (4 + 2 * 7) + 15 * 3  # of planar4dof: links and hands of the learner and of the expert, now and next
 DEFAULT = ("panda3dof", "panda4dof", "panda7dof", "planar4dof", "planar7dof")
 POLICIES, MAPPERS = (names_of_one_learner(kind) for kind in TRAINERS)
 FOLDERS = [f"{name}-{kind}" for kind in TRAINERS for name in names_of_one_learner(kind)]
@@ -171,7 +171,7 @@ def test_parameters_of_another_network_are_reported(copy):
     with pytest.raises(ValueError, match=r"params/Dense_0/bias: expected shape \(64,\), got shape \(128,\)"):
         read_network(copy, "pose_mapper")
     (copy / "config.yaml").write_text(config.replace("inputs: link_states", "inputs: angles"))
-    with pytest.raises(ValueError, match=r"params/Dense_0/kernel: expected shape \(7, 128\), got shape \(42, 128\)"):
+    with pytest.raises(ValueError, match=r"params/Dense_0/kernel: expected shape \(7, 128\), got shape \(51, 128\)"):
         read_network(copy, "pose_mapper")
 
 
