@@ -39,7 +39,11 @@ def demo_data(name: str) -> dict[str, Any]:
     assert isinstance(network.function, mimic.PoseMapper)
     model, params = network.function.model, network.function.params["params"]
     config, metric = model.config, model.pair().metric
-    if (config.inputs, config.outputs, config.activation) != ("link_states", "circle", "gelu") or not metric.is_static:
+    if (
+        (config.inputs, config.outputs, config.activation) != ("link_states", "circle", "gelu")
+        or not metric.is_static
+        or metric.hand_weights.position
+    ):
         raise ValueError(f"{name}: expected a mapper of the preset large and a static metric, got {config}")
     kernels = [params[f"Dense_{i}"] for i in range(len(params))]
     return {
@@ -47,7 +51,11 @@ def demo_data(name: str) -> dict[str, Any]:
         "expert": _arm(model.expert.embodiment),
         "learner": _arm(model.learner.embodiment),
         "correspondence": np.asarray(metric.correspondence).tolist(),
-        "weights": {part: float(getattr(metric.weights, part)) for part in ("translation", "rotation")},
+        "weights": {
+            "translation": float(metric.weights.translation),  # type: ignore[union-attr]
+            "rotation": float(metric.weights.rotation),  # type: ignore[union-attr]
+            "hand": float(metric.hand_weights.rotation),
+        },
         "heads": config.heads,
         "layers": [{part: _base64(layer[part]) for part in ("kernel", "bias")} for layer in kernels],
         "held_out": {
@@ -69,6 +77,8 @@ def _arm(arm: Any) -> dict[str, Any]:
         "link_joint": joint,
         "link_position": arm.link_position,
         "link_direction": arm.link_rotation[:, :, 0],
+        "hand_joint": arm.hand_joint[0],
+        "hand_axes": arm.hand_rotation[0].T,
         "segment_joint": joint[list(arm.segment_link)],
         "segment_start": arm.segment_start,
         "segment_end": arm.segment_end,

@@ -31,13 +31,14 @@ var mimicArms = (() => {
 
   const moved = (frame, point) => add(frame.p, apply(frame.R, subtract(point, frame.anchor)));
 
-  // Positions in chain lengths, and directions of the links.
+  // Positions in chain lengths and directions of the links, and the x-, y- and z-axis of the hand.
   function linkStates(arm, qpos) {
     const frame = frames(arm, qpos);
     const at = arm.link_joint.map((joint) => frame[joint + 1]);
     return {
       position: at.map((f, i) => moved(f, arm.link_position[i]).map((x) => x / arm.chain_length)),
       direction: at.map((f, i) => apply(f.R, arm.link_direction[i])),
+      hand: arm.hand_axes.map((axis) => apply(frame[arm.hand_joint + 1].R, axis)),
     };
   }
 
@@ -50,17 +51,21 @@ var mimicArms = (() => {
     ]);
   }
 
-  // Mean over all pairs of W (a_tr |p - p'| + a_rot (pi / 4) |e - e'|^2).
+  const square = (v) => v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
+
+  // Mean over all pairs of W (a_tr |p - p'| + a_rot (pi / 4) |e - e'|^2), and a_hand (pi / 8) |R - R'|^2 of the hands.
   function distance(data, expert, learner) {
     let sum = 0;
     data.correspondence.forEach((row, i) => row.forEach((w, j) => {
       if (w === 0) return;
       const translation = Math.hypot(...subtract(expert.position[i], learner.position[j]));
       const e = subtract(expert.direction[i], learner.direction[j]);
-      const angle = 0.25 * Math.PI * (e[0] * e[0] + e[1] * e[1] + e[2] * e[2]);
+      const angle = 0.25 * Math.PI * square(e);
       sum += w * (data.weights.translation * translation + data.weights.rotation * angle);
     }));
-    return sum / (data.correspondence.length * data.correspondence[0].length);
+    const links = sum / (data.correspondence.length * data.correspondence[0].length);
+    const turned = expert.hand.reduce((total, axis, i) => total + square(subtract(axis, learner.hand[i])), 0);
+    return links + data.weights.hand * (Math.PI / 8) * turned;
   }
 
   const poseDistance = (data, states, qpos) => distance(data, states, linkStates(data.learner, qpos));
@@ -85,7 +90,7 @@ var mimicArms = (() => {
 
   // The poses that the heads of the network propose.
   function candidates(data, states) {
-    let values = [...states.position.flat(), ...states.direction.flat()];
+    let values = [...states.position.flat(), ...states.direction.flat(), ...states.hand.flat()];
     data.layers.forEach((layer, i) => {
       values = dense(layer, values);
       if (i < data.layers.length - 1) values = values.map(gelu);
