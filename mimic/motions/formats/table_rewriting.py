@@ -9,9 +9,10 @@ import numpy as np
 
 from mimic.base.npz import read_arrays
 from mimic.motions.formats.archives import addresses
+from mimic.motions.formats.cells import read_cells
 from mimic.motions.formats.episodes import ANGLE, VELOCITY, Motion
 from mimic.motions.formats.replacing import Column, Replacement, replaced_columns
-from mimic.motions.formats.tables import read_cells, rows_of_table, tables_by_quantity
+from mimic.motions.formats.tables import rows_of_table, tables_by_quantity
 
 _DIGITS = ".9g"  # of a number in a table
 _BLANK = "\t"  # between cells that blanks separated
