@@ -222,7 +222,12 @@ class _Renderer:
 
 def _imitation_env(env: str | ImitationEnv, overrides: dict[str, Any]) -> ImitationEnv:
     if isinstance(env, str):
-        return make_env(env_config(env, **overrides))
+        config = env_config(env, **overrides)
+        if config.kind == "sampled_arms":
+            raise ValueError(
+                f"env: expected an environment of one learner, got {env!r}, which draws a learner for each episode"
+            )
+        return make_env(config)
     if overrides:
         raise ValueError(f"{next(iter(overrides))}: expected the name of an environment with it, got an ImitationEnv")
     return env

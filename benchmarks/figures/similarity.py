@@ -33,9 +33,9 @@ def draw_similarity() -> Any:
         for arm, pose in ((_EXPERT, _EXPERT_POSE), (_LEARNER, _LEARNER_POSE))
     ]
     values = similarity(*lines)
-    figure, panels = plt.subplots(1, len(MEASURES), figsize=(14, 3.3), layout="constrained", sharex=True, sharey=True)
+    figure, panels = plt.subplots(1, len(_TITLES), figsize=(14, 3.3), layout="constrained", sharex=True, sharey=True)
     draws = (_draw_distances, _draw_tangents, _draw_frechet, _draw_hands, _draw_hand_directions)
-    for axes, draw, name, title in zip(panels, draws, MEASURES, _TITLES, strict=True):
+    for axes, draw, name, title in zip(panels, draws, MEASURES[: len(_TITLES)], _TITLES, strict=True):
         draw_arm(axes, _EXPERT, _EXPERT_POSE, EXPERT_COLOUR, "expert", width=4, alpha=0.35)
         draw_arm(axes, _LEARNER, _LEARNER_POSE, LEARNER_COLOUR, "learner", width=4, alpha=0.35)
         draw(axes, *lines)

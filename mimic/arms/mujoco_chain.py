@@ -73,7 +73,7 @@ def read_chain(
         has_base = base_segment and (base is not None or chain_ids.base != _WORLD)
         tips = [found.position for found in hands]
         links = (_base_links(joints, paths) if has_base else []) + _anchor_links(joints, paths, tips)
-    if hand is None and any(model.text(i).name == UNKNOWN_HAND for i in range(model.ntext)):
+    if hand is None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, UNKNOWN_HAND) >= 0:
         hands = ()
     if len(paths) == 1:
         return Chain(tuple(joints), drop_zero_length(links), hands=hands)

@@ -7,6 +7,7 @@ import hashlib
 import io
 import json
 import os
+import shutil
 import stat
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,12 @@ def check_file(path: PathLike, max_bytes: int | None = MAX_BYTES) -> Path:
     """Checks a file that a library opens by its path; returns the path. See `open_file`."""
     _check(os.stat(path), max_bytes)
     return Path(path)
+
+
+def copy_file(source: PathLike, target: PathLike) -> None:
+    """Copies a regular file of any size. See `open_file`."""
+    with open_file(source, None) as content, open(target, "wb") as copy:
+        shutil.copyfileobj(content, copy)
 
 
 def check_folder(folder: PathLike) -> Path:

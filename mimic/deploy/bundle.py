@@ -19,10 +19,9 @@ FORMAT = 2
 POLICY, FEATURES = "policy.onnx", "features.onnx"
 CLEARANCE, CONTROLLER, MOTIONS = "clearance.npz", "controller.json", "motions.npz"
 _MODELS = POLICY, FEATURES, CLEARANCE
-LINK_NUMBERS = 12  # position, direction, linear and angular velocity
 _KEYS = (
     "format", "mimic_version", "mode", "period", "control_dt", "joint_names", "start_pose", "limits", "parameters",
-    "preview", "past_actions", "features", "expert_links", "robot", "hashes",
+    "preview", "past_actions", "features", "expert_numbers", "robot", "hashes",
 )  # fmt: skip
 
 
@@ -42,8 +41,8 @@ class Bundle:
       preview: number of later ticks whose expert states the policy observes.
       past_actions: number of its own actions that the policy observes.
       features: number of those that it observes of the expert.
-      expert_links: number of links of the expert.
-      expert: [motions, ticks + 1, expert_links * 12] the expert's link states at each tick.
+      expert_numbers: of the expert's link states at a tick.
+      expert: [motions, ticks + 1, expert_numbers] the expert's link states at each tick.
       start_poses: [motions, joints] where each motion starts [rad].
       names: of the motions.
       clearance: constants of the clearance of a pose.
@@ -60,7 +59,7 @@ class Bundle:
     preview: int
     past_actions: int
     features: int
-    expert_links: int
+    expert_numbers: int
     expert: np.ndarray
     start_poses: np.ndarray
     names: tuple[str, ...]
@@ -198,7 +197,6 @@ def _parsed(
     folder: Path, content: Mapping[str, Any], motions: Mapping[str, np.ndarray], clearance: Mapping[str, np.ndarray]
 ) -> Bundle:
     try:
-        links = content["expert_links"]
         return Bundle(
             folder=folder,
             robot=str(content["robot"]),
@@ -213,7 +211,7 @@ def _parsed(
             preview=int(content["preview"]),
             past_actions=int(content["past_actions"]),
             features=int(content["features"]),
-            expert_links=int(links) if isinstance(links, int) else len(links),
+            expert_numbers=int(content["expert_numbers"]),
             expert=np.asarray(motions["expert"], np.float32),
             start_poses=np.asarray(motions["start_poses"], float),
             names=tuple(str(name) for name in motions["names"]),
@@ -243,7 +241,7 @@ def _check(bundle: Bundle) -> None:
             f"limits.{name}": (value, (joints, 2) if name == "position" else (joints,))
             for name, value in limits.items()
         },
-        "expert": (bundle.expert, (motions, bundle.ticks + 1, LINK_NUMBERS * bundle.expert_links)),
+        "expert": (bundle.expert, (motions, bundle.ticks + 1, bundle.expert_numbers)),
         "start_poses": (bundle.start_poses, (motions, joints)),
         "names": (np.asarray(bundle.names), (motions,)),
     }

@@ -32,7 +32,7 @@ def test_one_compiled_function_serves_all_weights():
 
 
 def row(pair, method, values, kind="computed_torque"):
-    measures = {name: [value, 2 * value] for name, value in zip(MEASURES, values, strict=True)}
+    measures = {name: [value, 2 * value] for name, value in zip(MEASURES, (*values, values[-1]), strict=True)}
     return {"pair": pair, "set": kind, "method": method, "measures": measures}
 
 

@@ -171,7 +171,7 @@ def test_a_checkpoint_of_another_environment(reason, run_dir, tmp_path):
     shutil.copytree(run_dir / "checkpoints", other / "checkpoints")
     error = reason("evaluate", f"run={other}", "compilation_cache=")
     # 12 numbers for each link seen: 3 of the learner and twice 3 of the expert, where the other learner has 2.
-    assert "does not fit the config of its run" in error and "expected shape (108,), got shape (96,)" in error
+    assert "does not fit the config of its run" in error and "expected shape (153,), got shape (141,)" in error
 
 
 def test_a_mapper_has_no_controllers(reason, tmp_path):

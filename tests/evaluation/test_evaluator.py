@@ -319,6 +319,7 @@ def test_one_demonstration_has_the_references_that_it_has_among_all(evaluator):
 def test_bound_and_hold_distance_belong_to_the_samples_after_each_step():
     """Closed forms for the directions of planar arms. 1e-4: the tolerance of the search."""
     metric = {"correspondence": "overlap", "translation": 0.0, "linear_velocity": 0.0, "angular_velocity": 0.0}
+    metric |= {"hand_rotation": 0.0}
     few = {"count": 1, "held_out": 1}
     config = mimic.env_config("planar4dof", **SHORT_ARMS, demonstrations=few, horizon=12, metric=metric)
     training, held_out = training_and_held_out(config)

@@ -119,7 +119,7 @@ def make_bundle(
             "preview": PREVIEW,
             "past_actions": PAST,
             "features": FEATURES,
-            "expert_links": LINKS,
+            "expert_numbers": 12 * LINKS,
         },
         expert=expert,
         start_poses=start_poses,

@@ -23,7 +23,7 @@ def test_the_matrix_of_a_file_is_the_correspondence(tmp_path, suffix):
         np.savetxt(path, MATRIX, delimiter=", ")
     else:
         np.savez(path, correspondence=MATRIX)
-    config = MetricConfig(correspondence=path)
+    config = MetricConfig(correspondence=path, hand_rotation=0.0)
     metric = config.build(EXPERT, LEARNER)
     assert metric.is_static
     np.testing.assert_array_equal(metric.correspondence, MATRIX)

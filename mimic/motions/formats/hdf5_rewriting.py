@@ -1,13 +1,12 @@
 """Writes HDF5 files of demonstrations again for another arm; all other data sets and attributes stay as they are."""
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mimic.base.files import check_file
+from mimic.base.files import copy_file
 from mimic.motions.formats.episodes import Motion
 from mimic.motions.formats.hdf5 import (
     MODEL,
@@ -38,7 +37,7 @@ def rewrite_hdf5(source: Path, out: Path, replacement: Replacement) -> list[str]
     files = files_of(source)
     for file in files:
         path = out / file.name
-        shutil.copyfile(check_file(file, None), path)
+        copy_file(file, path)
         path.chmod(0o644)
         with h5py.File(path, "r+") as content:
             removed = set()

@@ -1,14 +1,13 @@
 """Writes a LeRobot dataset, version 2 or 3, again for another arm; other features and videos stay as they are."""
 
 import json
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mimic.base.files import check_file, read_json, read_text
+from mimic.base.files import check_file, copy_file, read_json, read_text
 from mimic.motions.formats.lerobot import DATA_FOLDER, EPISODES_FOLDER, INFO, STATS, statistics
 from mimic.motions.formats.lerobot_reading import FINAL, feature_names, numbers
 from mimic.motions.formats.replacing import Column, Replacement, replaced_columns, replaced_values
@@ -229,7 +228,7 @@ def _copy_others(source: Path, out: Path, plan: _Plan) -> None:
         elif "episode_" in file.name or file.parent.name.startswith("episode_"):
             continue  # of an episode that is left out
         path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(check_file(file, None), path)
+        copy_file(file, path)
 
 
 def _renumbered(name: str, old: int, plan: _Plan) -> str:

@@ -17,6 +17,7 @@ from mimic.control import joint_control
 from mimic.control.joint_control import JointParameters
 from mimic.deploy.bundle import write_bundle
 from mimic.deploy.safety import check_supported
+from mimic.envs.imitation import observation_layout
 from mimic.envs.world_env import SENT_ACTIONS, HardwareEnv
 from mimic.metric.kinematics import LinkStates, link_states
 from mimic.retargeting.clearance import clearance_constants
@@ -26,8 +27,6 @@ from mimic.trainers.export.onnx_model import to_onnx
 from mimic.trainers.ppo import ppo
 from mimic.trainers.ppo.trainer import run_environment
 from mimic.trainers.run_config import load_config
-
-_NUMBERS = 12  # of a link's state
 
 
 def export_controller(run_dir: Path, out: Path, checkpoint: int | None = None) -> None:
@@ -95,8 +94,9 @@ def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
     """
     statistics, policy, *_ = params
     layers = [policy["params"][f"hidden_{index}"] for index in range(len(policy["params"]))]
-    joints, own_links = env.learner.num_joints, _NUMBERS * env.learner.num_links
-    expert_size = (env.config.preview + 1) * _NUMBERS * env.expert.num_links
+    layout = observation_layout(env.expert, env.learner, env.config.preview)
+    own_links = next(part["start"] for part in layout if part["name"].startswith("expert"))
+    joints, expert_size = env.learner.num_joints, layout[-1]["stop"] - own_links
     is_expert = np.zeros(env.observation_size, bool)
     is_expert[own_links : own_links + expert_size] = True
     mean = np.array(statistics.mean)
@@ -145,5 +145,5 @@ def _description(env: HardwareEnv, steps: int) -> dict[str, Any]:
         "parameters": {name: x.tolist() for name, x in parameters._asdict().items()},
         "preview": config.preview,
         "past_actions": SENT_ACTIONS,
-        "expert_links": env.expert.num_links,
+        "expert_numbers": expert_table(env).shape[-1],
     }
