@@ -56,5 +56,5 @@ def untrained_run(folder: Path, env: EnvConfig | None = None, **settings: Any) -
     env = trainer.evaluator.env
     networks = make_networks(trainer.settings, env.observation_size, env.action_size)
     initial = jax.jit(lambda key: initial_params(networks, env.observation_size, key))
-    save_checkpoint(folder, 0, initial(jax.random.PRNGKey(0)))
+    save_checkpoint(folder, 0, initial(jax.random.PRNGKey(2)))  # a policy without jumps
     return folder
