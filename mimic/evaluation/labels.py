@@ -4,12 +4,11 @@ from collections.abc import Mapping
 
 SPLITS = ("train", "held_out")
 ALL_KINDS = "all"
-SIMILARITY_HEADERS = {  # positions in chain lengths
+SIMILARITY_HEADERS = {  # of tables and pictures; positions in chain lengths
     "centre_line_distance": "centre\nline",
     "tangent_angle_deg": "tangent\nangle",
     "frechet_distance": "Frechet\ndistance",
     "hand_position_error": "hand\nposition",
-    "hand_angle_deg": "hand\nangle",
     "hand_rotation_deg": "hand\nrotation",
 }
 SPLIT_NAMES = {"train": "training", "held_out": "held out"}

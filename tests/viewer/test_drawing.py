@@ -57,9 +57,9 @@ def test_drawings_contain_their_numbers():
     assert all(text in table for text in (">1.00<", ">0.25<", ">3.00<", ">1+2<", "&lt;b&gt;")) and "<b>" not in table
     assert ">0.1235<" in html.numbers(0.12345, 0.1) and "…" in html.numbers(0.1, float("nan"))
     assert ">12.9<" in html.heat_maps(np.array([[12.94]]), np.eye(1), ["link1"], ["link1"])  # five do not fit
-    mixed = {"hand_angle_deg": 4.0, "centre_line_distance": 0.01, "tangent_angle_deg": 2.0}  # as jit sorts them
+    mixed = {"hand_rotation_deg": 4.0, "centre_line_distance": 0.01, "tangent_angle_deg": 2.0}  # as jit sorts them
     shown = html.numbers(0.1, 0.1, similarity=mixed)
-    assert shown.index("centre line") < shown.index("tangent angle") < shown.index("hand angle")
+    assert shown.index("centre line") < shown.index("tangent angle") < shown.index("hand rotation")
     time_s, unknown = np.linspace(0, 1, 5), np.array([np.nan, np.nan, 0.1, 0.1, 0.1])
     svg = html.chart(time_s, [("distance", time_s, "red"), ("bound", unknown, "black")], now=0.5)
     assert svg.count("<polyline") == 2 and "nan" not in svg
