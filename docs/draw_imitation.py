@@ -55,7 +55,9 @@ def main() -> None:
 
 def _demonstration() -> Float[np.ndarray, "frames joints"]:
     """A recorded motion [rad] at the times of the frames."""
-    recorded = mimic.record_demonstrations(mimic.build_arm(mimic.ArmConfig()), DEMONSTRATION + 1, seed=SEED)
+    recorded = mimic.record_demonstrations(
+        mimic.build_arm(mimic.ArmConfig()), DEMONSTRATION + 1, kind="computed_torque", seed=SEED
+    )
     qpos = recorded.qpos[DEMONSTRATION]
     time = recorded.dt * np.arange(len(qpos))
     frames = np.arange(0, time[-1], FRAME / 1000)
