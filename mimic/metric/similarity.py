@@ -232,9 +232,8 @@ def hand_angle(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
 def hand_rotation(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
     """Angle of the rotation between the hand frames [rad], in [0, pi]; NaN where a hand is not known."""
     numpy, difference = array_library(expert.hand_axes), expert.hand_axes - learner.hand_axes
-    # |R - R_hat| = sqrt(8) sin(theta / 2)
-    square = (difference * difference).sum(axis=(-1, -2)) / 8
-    return 2 * numpy.arcsin(numpy.minimum(numpy.sqrt(square), 1))
+    chord = _norm(difference.reshape(*difference.shape[:-2], 9))  # |R - R_hat| = sqrt(8) sin(theta / 2)
+    return 2 * numpy.arcsin(numpy.minimum(chord / np.sqrt(8), 1)).astype(difference.dtype)
 
 
 def similarity(expert: CentreLine, learner: CentreLine) -> dict[str, Float[Any, "*batch"]]:

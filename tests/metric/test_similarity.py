@@ -140,3 +140,15 @@ def test_gradients_are_finite_at_a_match():
 def test_fewer_than_one_sample_is_rejected(unchecked):
     with pytest.raises(ValueError, match="samples: expected at least 1, got 0"):
         centre_line_table(panda(), np.zeros(7), samples=0)
+
+
+def test_the_rotation_of_hands_sees_the_last_joint_and_has_no_kink_that_is_nan():
+    arm, pose = panda(), np.full(7, 0.3, np.float32)
+    line = centre_line(arm, pose)
+
+    @jax.jit
+    def angle(qpos):
+        return similarity.hand_rotation(line, centre_line(arm, qpos))
+
+    np.testing.assert_allclose(angle(pose + 0.5 * np.eye(7, dtype=np.float32)[6]), 0.5, atol=1e-5)  # float32
+    np.testing.assert_array_equal(jax.jit(jax.grad(angle))(pose), 0)
