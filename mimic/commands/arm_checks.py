@@ -136,7 +136,8 @@ def warnings(config: ArmConfig, arm: Arm) -> Iterator[str]:
     embodiment, names = arm.embodiment, np.array(arm.embodiment.joint_names)
     without_link = names[max(embodiment.link_joint) + 1 :]
     if without_link.size:
-        yield f"{_listed(without_link)}: moves no link, so the metric ignores it; a more distal tip would include it"
+        seen = "sees it by the hand alone" if embodiment.hand_joint else "ignores it"
+        yield f"{_listed(without_link)}: moves no link, so the metric {seen}; a more distal tip would include it"
     coincident = [
         name for index, name in enumerate(names) if index not in embodiment.link_joint and name not in without_link
     ]
