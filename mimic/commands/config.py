@@ -22,7 +22,7 @@ from mimic.retargeting.costs import Costs
 from mimic.trainers.config import trainers
 from mimic.trainers.export.config import check_locked
 
-ROBOT_WORLDS = ("paper", "nominal", "hardware")
+ROBOT_WORLDS = ("nominal", "hardware")
 ROBOTS = ("virtual_panda", "virtual_robot")
 ROBOT_LOOPS = ("mimic", "ruckig")
 CONTROLLERS = (
@@ -56,7 +56,7 @@ class EvaluateConfig:
       robot: "virtual_panda": the policy, or "tracking", controls virtual Pandas in C MuJoCo, which abort as real ones
         do; "virtual_robot": the same for another learner. Default "": the environment of the run.
       episodes: number of episodes of `robot`, of each case with `edges`.
-      robot_world: preset of the world of `robot`: "paper", "nominal" or "hardware". Default "": that of the run.
+      robot_world: preset of the world of `robot`: "nominal" or "hardware". Default "": that of the run.
       robot_loop: control loop of `robot`: "mimic", the one of training, or "ruckig", online trajectories as those of
         franky-control.
       edges: whether there are also cases with each range of the world at its ends.

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
@@ -19,21 +18,21 @@ from mimic.commands.config import EvaluateConfig
 from mimic.deploy.bundle import MOTIONS
 from mimic.deploy.safety import COLLISION, LATE, check_supported
 from mimic.envs import env_config
+from mimic.envs.world_env import HardwareEnv
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.evaluation.tracking_controllers import run_tracking
 from mimic.evaluation.virtual_robot.arm_model import RobotModel, robot_model
 from mimic.evaluation.virtual_robot.draws import draw_world, edge_cases
-from mimic.evaluation.virtual_robot.episodes import Episodes, TorquePolicy, TrackingPolicy
+from mimic.evaluation.virtual_robot.episodes import Episodes, TrackingPolicy
 from mimic.evaluation.virtual_robot.robots import LIMIT_CAUSES, SELF_CONTACT
 from mimic.evaluation.virtual_robot.runs import Task, run_tasks
-from mimic.metric.kinematics import link_state_table, link_states
+from mimic.metric.kinematics import link_state_table
 from mimic.physics.world import WorldConfig
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.provenance import hardware, versions
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.export.config import ExportConfig
 from mimic.trainers.ppo.trainer import PPOTrainer
 
 ALL = "all ranges"
@@ -52,15 +51,15 @@ def prepare_robot_evaluation(
     assert isinstance(trainer, PPOTrainer)
     out = new_folder("out", config.out) if config.out else None
     steps = check_checkpoint(run_dir, config.checkpoint)
-    own = trained.env.world or WorldConfig()
-    world = env_config("panda7dof", world=config.robot_world).world or WorldConfig() if config.robot_world else own
+    own = cast(WorldConfig, trained.env.world)
+    world = cast(WorldConfig, env_config("panda7dof", world=config.robot_world).world) if config.robot_world else own
     floor_height = own.floor_height  # where the robot stands, whatever its world is
     world, robot = dataclasses.replace(world, floor_height=floor_height), robot_model(trained.env.learner, floor_height)
 
     def run() -> None:
         console = Console()
         with tempfile.TemporaryDirectory(prefix="mimic-") as folder:
-            policy = _policy(trained, trainer.evaluator, run_dir, steps, Path(folder))
+            policy = _bundle(trainer.evaluator, run_dir, steps, Path(folder))
             if config.controller == "tracking":
                 policy = _tracking(trainer.evaluator, policy)
             cases = _cases(world, config)
@@ -97,11 +96,9 @@ def _check(config: EvaluateConfig, trained: TrainConfig) -> None:
                          f"trainer={trained.trainer.name}")  # fmt: skip
     if config.robot == "virtual_panda" and trained.env.learner.model != "panda":
         raise ValueError("robot: expected virtual_robot for another learner than a Panda, got virtual_panda")
-    env = trained.env
-    if env.kind == "inner_loop":
-        check_supported(env.control, env.control_dt)
-    elif env.observation.terms or env.environment:
-        raise ValueError("robot: expected a run without observation.terms and environment, or with an inner loop")
+    if trained.env.kind != "inner_loop":
+        raise ValueError("robot: expected a run with an inner loop, as of world=hardware, got one without")
+    check_supported(trained.env.control, trained.env.control_dt)
 
 
 def _cases(world: WorldConfig, config: EvaluateConfig) -> list[tuple[str, WorldConfig, str]]:
@@ -112,7 +109,7 @@ def _cases(world: WorldConfig, config: EvaluateConfig) -> list[tuple[str, WorldC
 
 def _task(
     robot: RobotModel,
-    policy: Path | TrackingPolicy | TorquePolicy,
+    policy: Path | TrackingPolicy,
     evaluator: Evaluator,
     case: tuple[str, WorldConfig, str],
     config: EvaluateConfig,
@@ -135,55 +132,26 @@ def _run(tasks: list[Task], console: Console) -> list[Episodes]:
         return run_tasks(tasks, lambda count: progress.advance(bar, count))
 
 
-def _policy(trained: TrainConfig, evaluator: Evaluator, run_dir: Path, steps: int, folder: Path) -> Path | TorquePolicy:
-    """The policy as a bundle, or as torques where the run has no inner loop."""
-    expert = _expert_table(evaluator)
-    if trained.env.kind != "inner_loop":
-        model = _torque_model(evaluator, run_dir, steps)
-        return TorquePolicy(model, expert, trained.env.preview, trained.env.control_dt)
-    from mimic.trainers.export.export_controller import export_controller
+def _bundle(evaluator: Evaluator, run_dir: Path, steps: int, folder: Path) -> Path:
+    """The policy as a bundle, with the motions of the evaluation."""
+    from mimic.trainers.export.export_controller import expert_table, export_controller
 
     bundle = folder / "bundle"
     export_controller(run_dir, bundle, steps)
     count = evaluator.env.demonstrations.count
     np.savez(  # the motions of the evaluation, in its order
         bundle / MOTIONS,
-        expert=expert,
+        expert=expert_table(cast(HardwareEnv, evaluator.env)),
         start_poses=np.asarray(evaluator.env.start_poses, float),
         names=np.array([f"motion {i}" for i in range(count)]),
     )
     return bundle
 
 
-def _tracking(evaluator: Evaluator, bundle: Path | TorquePolicy) -> TrackingPolicy:
+def _tracking(evaluator: Evaluator, bundle: Path) -> TrackingPolicy:
     """The controller "tracking", with the best lead in the environment of the run."""
-    assert isinstance(bundle, Path)
     _, lead = run_tracking(evaluator)
     return TrackingPolicy(bundle, np.asarray(evaluator.nearest_poses, float), lead)
-
-
-def _expert_table(evaluator: Evaluator) -> np.ndarray:
-    """The expert's link states [motions, ticks + 1, numbers], as policies observe them."""
-    steps = evaluator.env.config.horizon + 1
-    leaves = [np.asarray(leaf)[:, :steps] for leaf in jax.tree.leaves(evaluator.env.expert_states)]
-    return np.concatenate([leaf.reshape(*leaf.shape[:2], -1) for leaf in leaves], axis=-1).astype(np.float32)
-
-
-def _torque_model(evaluator: Evaluator, run_dir: Path, steps: int) -> bytes:
-    """The exported policy behind its observation, as ONNX: from qpos, qvel and expert to torque."""
-    from mimic.trainers.export.export import exported_function
-    from mimic.trainers.export.onnx_model import to_onnx
-
-    env = evaluator.env
-    policy = exported_function(ExportConfig(str(run_dir), checkpoint=steps))
-
-    def function(qpos: jax.Array, qvel: jax.Array, expert: jax.Array) -> dict[str, jax.Array]:
-        states = [leaf.ravel() for leaf in jax.tree.leaves(link_states(env.learner, qpos, qvel))]
-        return {"torque": policy.function(jnp.concatenate([*states, expert]))["torque"]}
-
-    joints, ticks = env.learner.num_joints, env.config.preview + 1
-    experts = ticks * sum(leaf[0, 0].size for leaf in jax.tree.leaves(env.expert_states))
-    return to_onnx(function, name="policy", inputs={"qpos": joints, "qvel": joints, "expert": experts})
 
 
 def summary(evaluator: Evaluator, episodes: Episodes) -> dict[str, Any]:

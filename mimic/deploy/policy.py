@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 _OBSERVED = "qpos", "qvel", "reference_qpos", "reference_qvel"
 
 
-def open_session(path: Path | bytes, inputs: dict[str, int], outputs: dict[str, int]) -> "onnxruntime.InferenceSession":
+def open_session(path: Path, inputs: dict[str, int], outputs: dict[str, int]) -> "onnxruntime.InferenceSession":
     """A session on one thread.
 
     Args:
-      path: ONNX file, or its content.
+      path: ONNX file.
       inputs, outputs: expected lengths of the vectors, by name.
 
     Raises:
@@ -32,20 +32,18 @@ def open_session(path: Path | bytes, inputs: dict[str, int], outputs: dict[str, 
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    name = "policy" if isinstance(path, bytes) else path.name
     try:
-        content = path if isinstance(path, bytes) else read_bytes(path)
-        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(read_bytes(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's errors have no common class
         line = " ".join(str(error).split())[:200]
-        raise ValueError(f"bundle: {name}: expected an ONNX model: {line}") from error
+        raise ValueError(f"bundle: {path.name}: expected an ONNX model: {line}") from error
     for kind, expected, nodes in (
         ("inputs", inputs, session.get_inputs()),
         ("outputs", outputs, session.get_outputs()),
     ):
         sizes = {node.name: node.shape[-1] for node in nodes}
         if sizes != expected:
-            raise ValueError(f"bundle: {name}: {kind}: expected {_text(expected)}, got {_text(sizes)}")
+            raise ValueError(f"bundle: {path.name}: {kind}: expected {_text(expected)}, got {_text(sizes)}")
     return session
 
 

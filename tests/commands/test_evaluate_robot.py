@@ -63,11 +63,6 @@ def hardware_run(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def paper_run(tmp_path_factory):
-    return untrained(tmp_path_factory.mktemp("runs") / "paper")
-
-
-@pytest.fixture(scope="module")
 def evaluation(hardware_run, tmp_path_factory):
     """A function that evaluates the run in the hardware world, whose trainer and bundle are made once."""
     trained = load_config(hardware_run)
@@ -105,15 +100,6 @@ def test_a_policy_of_the_hardware_world(evaluation, tmp_path, capsys, loop):
     assert row["lower_bound"] < row["mean_distance"] and np.isfinite(row["optimality_gap"])
     printed = capsys.readouterr().out
     assert "4 episodes on virtual_panda" in printed and "aborts of the robot" in printed
-
-
-@pytest.mark.slow
-def test_a_policy_of_the_papers_world_aborts(paper_run, tmp_path):
-    """Torques that jump from one tick to the next: the robot's limit is 1000 N m/s."""
-    report = evaluate(paper_run, tmp_path / "new", robot_world="hardware")
-    row = report["cases"]["all ranges"]
-    assert row["aborts"] == {"torque rate": 4} and row["completed"] == 0 and row["limit_violations"] == 4
-    assert report["control"] == "torque" and report["world"]["gravity"]
 
 
 @pytest.mark.slow
@@ -184,9 +170,13 @@ def test_an_exported_policy_is_the_policy(hardware_run, tmp_path):
         past = np.concatenate([expected, past[:, : -env.action_size]], axis=1)
 
 
-def test_a_run_without_an_inner_loop_has_no_controller(reason, paper_run):
-    error = reason("export", f"run={paper_run}", "format=controller", "out=new")
-    assert "format=controller: expected a run of trainer=ppo with an inner loop" in error
+def test_a_run_without_an_inner_loop_has_no_controller_and_no_robot(tmp_path):
+    trained = TrainConfig(mimic.env_config("panda7dof"), PPOConfig())
+    save_config(tmp_path, trained)
+    with pytest.raises(ValueError, match="format=controller: expected a run of trainer=ppo with an inner loop"):
+        prepare_controller(tmp_path)
+    with pytest.raises(ValueError, match="robot: expected a run with an inner loop, as of world=hardware, got one"):
+        prepare_robot_evaluation(EvaluateConfig(robot="virtual_panda"), trained, None, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -245,7 +235,7 @@ def test_what_does_not_fit_is_rejected(reason, hardware_run, tmp_path):
         (["robot=panda"], "robot: expected one of virtual_panda, virtual_robot, got 'panda'"),
         (["edges=true"], "robot_world, robot_loop, edges: expected only with robot="),
         (["robot=virtual_panda", "robot_loop=mars"], "robot_loop: expected one of mimic, ruckig"),
-        (["robot=virtual_panda", "robot_world=mars"], "robot_world: expected one of paper, nominal, hardware"),
+        (["robot=virtual_panda", "robot_world=mars"], "robot_world: expected one of nominal, hardware"),
         (["robot=virtual_panda", "controller=pd"], "controller: expected policy or tracking with robot=, got pd"),
         (["robot=virtual_panda", "mass=1.2"], "expected none with robot="),
         (["robot=virtual_panda", "episodes=0"], "episodes: expected a whole number from 1"),

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -10,9 +10,9 @@ from mimic.control.joint_control import PERIOD, Reference, action_towards
 from mimic.deploy.bundle import Bundle
 from mimic.deploy.clearance import Clearance
 from mimic.deploy.config import SafetyConfig
-from mimic.deploy.policy import Policy, open_session
+from mimic.deploy.policy import Policy
 from mimic.deploy.runner import TickPolicy
-from mimic.deploy.safety import INTERVENTIONS, SafetyLayer
+from mimic.deploy.safety import SafetyLayer
 from mimic.evaluation.virtual_robot.draws import World
 from mimic.evaluation.virtual_robot.loops import ControlLoop
 from mimic.evaluation.virtual_robot.robots import VirtualRobots
@@ -57,30 +57,7 @@ def joined(parts: list[Episodes]) -> Episodes:
     )
 
 
-class Controller(Protocol):
-    """Controls robots in lockstep; all arrays are [robots, ...]."""
-
-    ticks: int
-    periods: int  # of a tick
-
-    def tick(self, tick: int, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Begins a tick with a measurement."""
-        ...
-
-    def torque(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """The torques of a period, from a measurement."""
-        ...
-
-    def drop(self, is_aborted: np.ndarray) -> None:
-        """Is told which robots have aborted."""
-        ...
-
-    def counted(self) -> dict[str, Any]:
-        """`stops`, `interventions`, `tracking_error` and `clearance` of the episodes."""
-        ...
-
-
-def run_episodes(robots: VirtualRobots, controller: Controller, motion: np.ndarray) -> Episodes:
+def run_episodes(robots: VirtualRobots, controller: "SafeController", motion: np.ndarray) -> Episodes:
     """Runs one episode on each robot."""
     rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for tick in range(controller.ticks):
@@ -150,6 +127,8 @@ class Tracker:
 class SafeController:
     """A policy with the safety layer of a bundle, as `mimic.deploy` runs them, and the control loops of the robots.
 
+    It controls robots in lockstep; all arrays are [robots, ...].
+
     Args:
       bundle: see `load_bundle`.
       motion: [robots] index of the motion.
@@ -183,7 +162,7 @@ class SafeController:
         self._loop = ControlLoop(loop, bundle.parameters, bundle.limits, qpos)
 
     def tick(self, tick: int, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """See `Controller`."""
+        """Begins a tick with a measurement."""
         reference = self._layer.reference
         values = np.concatenate([qpos, qvel, reference.qpos.T, reference.qvel.T], axis=1)
         seen = np.split(self._channel.observed(values), 4, axis=1)
@@ -194,78 +173,22 @@ class SafeController:
         self._left = self._latency
 
     def torque(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """See `Controller`; the command of a tick acts after the latency."""
+        """The torques of a period, from a measurement; the command of a tick acts after the latency."""
         if self._left == 0 and self._command is not None:
             self._loop.command(self._command)
         self._left -= 1
         return self._loop.torque(qpos, qvel)
 
     def drop(self, is_aborted: np.ndarray) -> None:
-        """See `Controller`."""
+        """Is told which robots have aborted."""
         self._layer.release(is_aborted, ABORTED)
 
     def counted(self) -> dict[str, Any]:
-        """See `Controller`."""
+        """`stops`, `interventions`, `tracking_error` and `clearance` of the episodes."""
         layer = self._layer
         return {
             "stops": np.where(layer.cause == ABORTED, "", layer.cause),
             "interventions": layer.counts,
             "tracking_error": layer.tracking_error,
             "clearance": layer.clearance,
-        }
-
-
-@dataclasses.dataclass(frozen=True)
-class TorquePolicy:
-    """A policy of torques that are constant in a tick, without an inner loop: the paper's.
-
-    Attributes:
-      model: ONNX from qpos, qvel and expert (link states as in a bundle) to torque [N m].
-      expert: [motions, ticks + 1, numbers] the expert's link states.
-      preview: see `Bundle`.
-      control_dt: tick [s].
-    """
-
-    model: bytes
-    expert: np.ndarray
-    preview: int
-    control_dt: float
-
-
-class TorqueController:
-    """Robots with torques straight from a policy: nothing limits them and nothing checks them."""
-
-    def __init__(self, policy: TorquePolicy, motion: np.ndarray, joints: int, world: World, seed: int = 0):
-        experts = (policy.preview + 1) * policy.expert.shape[-1]
-        inputs = {"qpos": joints, "qvel": joints, "expert": experts}
-        self._session = open_session(policy.model, inputs, {"torque": joints})
-        self._expert, self._preview = policy.expert[motion], policy.preview
-        self.ticks, self.periods = policy.expert.shape[1] - 1, round(policy.control_dt / PERIOD)
-        self._channel = Channel(world, joints, seed)
-        self._torque = np.zeros((len(motion), joints))
-
-    def tick(self, tick: int, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """See `Controller`."""
-        qpos, qvel = np.split(self._channel.observed(np.concatenate([qpos, qvel], axis=1)), 2, axis=1)
-        steps = np.minimum(np.arange(tick, tick + self._preview + 1), self.ticks)
-        feed = {"qpos": qpos, "qvel": qvel, "expert": self._expert[:, steps].reshape(len(qpos), -1)}
-        (torque,) = self._session.run(["torque"], {key: np.asarray(x, np.float32) for key, x in feed.items()})
-        arrived, is_present = self._channel.arrived(np.asarray(torque, float))
-        self._torque = np.where(is_present[:, None], arrived, self._torque)
-
-    def torque(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """See `Controller`."""
-        return self._torque
-
-    def drop(self, is_aborted: np.ndarray) -> None:
-        """Does nothing."""
-
-    def counted(self) -> dict[str, Any]:
-        """See `Controller`."""
-        zero = np.zeros(len(self._torque))
-        return {
-            "stops": np.full(len(zero), "", object),
-            "interventions": {name: zero.astype(int) for name in INTERVENTIONS},
-            "tracking_error": zero,
-            "clearance": zero + np.inf,
         }

@@ -15,8 +15,6 @@ from mimic.evaluation.virtual_robot.draws import World
 from mimic.evaluation.virtual_robot.episodes import (
     Episodes,
     SafeController,
-    TorqueController,
-    TorquePolicy,
     Tracker,
     TrackingPolicy,
     joined,
@@ -35,7 +33,7 @@ class Task:
 
     Attributes:
       robot: the model.
-      policy: folder of a bundle, poses to track, or a policy of torques.
+      policy: folder of a bundle, or poses to track.
       world: of each episode.
       motion: [episodes] index of the motion.
       start_poses: [episodes, joints] [rad].
@@ -44,7 +42,7 @@ class Task:
     """
 
     robot: RobotModel
-    policy: Path | TrackingPolicy | TorquePolicy
+    policy: Path | TrackingPolicy
     world: World
     motion: np.ndarray
     start_poses: np.ndarray
@@ -55,10 +53,7 @@ class Task:
 def run_task(task: Task) -> Episodes:
     """Runs the episodes of a task."""
     robots = VirtualRobots(task.robot, task.world, task.start_poses, task.seed)
-    if isinstance(task.policy, TorquePolicy):
-        joints = task.start_poses.shape[1]
-        controller = TorqueController(task.policy, task.motion, joints, task.world, task.seed)
-    elif isinstance(task.policy, TrackingPolicy):
+    if isinstance(task.policy, TrackingPolicy):
         bundle = load_bundle(task.policy.bundle)
         tracker = Tracker(task.policy, bundle, task.motion)
         # It knows the reference of the inner loop itself, without the delay of a measurement.
