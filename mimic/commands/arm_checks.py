@@ -147,7 +147,12 @@ def warnings(config: ArmConfig, arm: Arm) -> Iterator[str]:
     outside = names[(embodiment.home < lower) | (embodiment.home > upper)]
     if outside.size:
         yield f"{_listed(outside)}: the start pose is outside the joint range; limits=hardware starts inside it"
-    yield from (f"the hand: {end.doubt}; learner.hand= sets it" for end in arm.ends if end.doubt)
+    yield from hand_doubts("learner", arm)
+
+
+def hand_doubts(role: str, arm: Arm) -> Iterator[str]:
+    """Yields what speaks against the hand frames of an arm; `role` is that of its keys."""
+    yield from (f"the hand of {arm.embodiment.name}: {x.doubt}; {role}.hand= sets it" for x in arm.ends if x.doubt)
 
 
 def stabilised(config: ArmConfig, arm: Arm, env: EnvConfig) -> tuple[ArmConfig, str]:

@@ -313,8 +313,10 @@ class InspectConfig:
       learner: arm to inspect.
       expert: arm that it should imitate.
       limits: see `EnvConfig`.
-      bound: whether to compute the kinematic bound of the distance, which takes a minute.
-      out: new folder for a picture of both arms with their correspondence, and a JSON file of all results.
+      bound: whether to compute the kinematic bound of the distance and what the hand keeps, which takes a minute.
+      base: where the learner's base stands, see `RetargetConfig`; "auto" for where most of the expert's range is exact.
+      out: new folder for a picture of both arms with their correspondence and their reach, and a JSON file of all
+        results.
       clip: motion capture file to inspect instead of an arm.
       capture: how it is read.
     """
@@ -323,16 +325,34 @@ class InspectConfig:
     expert: ArmConfig = dataclasses.field(default_factory=ArmConfig)
     limits: str = "none"
     bound: bool = True
+    base: Any = "same"
     out: str = ""
     clip: str = ""
     capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
 
     def __post_init__(self) -> None:
         check_choice("limits", self.limits, LIMITS)
+        _ = base_numbers(self.base)
+        if self.base != "same" and (not self.bound or self.clip):
+            raise ValueError("base: expected none with bound=false or clip=, which compare no hands")
 
 
 _HANDS, _FAILING = ("exact", "near", "scaled"), ("left_out", "kept")
 _BASE = "x", "y", "z", "yaw"
+
+
+def base_numbers(base: Any) -> list[float] | None:
+    """The learner's base in the expert's base frame, [x, y, z, yaw] [m, rad]; None for the same or one to find.
+
+    Raises:
+      ValueError: the value of the key `base` is nothing of the kind.
+    """
+    if isinstance(base, list | tuple) and len(base) == len(_BASE):
+        if all(isinstance(x, int | float) and math.isfinite(x) for x in base):
+            return [float(number) for number in base]
+    elif base in ("same", "auto"):
+        return None
+    raise ValueError(f"base: expected same, auto or [{','.join(_BASE)}], got {base!r}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -384,17 +404,8 @@ class RetargetConfig:
 
     @property
     def placement(self) -> list[float] | None:
-        """The learner's base in the expert's base frame, [x, y, z, yaw] [m, rad]; None for the same or one to find.
-
-        Raises:
-          ValueError: `base` is nothing of the kind.
-        """
-        if isinstance(self.base, list | tuple) and len(self.base) == len(_BASE):
-            if all(isinstance(x, int | float) and math.isfinite(x) for x in self.base):
-                return [float(number) for number in self.base]
-        elif self.base in ("same", "auto"):
-            return None
-        raise ValueError(f"base: expected same, auto or [{','.join(_BASE)}], got {self.base!r}")
+        """See `base_numbers`."""
+        return base_numbers(self.base)
 
     def resolve(self) -> EnvConfig:
         """Returns the environment with the limits set in this config."""

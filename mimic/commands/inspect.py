@@ -11,6 +11,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
+from matplotlib.axes import Axes  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.markup import escape  # noqa: E402
 from rich.table import Table  # noqa: E402
@@ -20,7 +21,14 @@ from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.arms.simulation_model import effective_inertia  # noqa: E402
 from mimic.base.config import new_folder  # noqa: E402
 from mimic.commands import arm_checks  # noqa: E402
-from mimic.commands.config import InspectConfig  # noqa: E402
+from mimic.commands.config import InspectConfig, base_numbers  # noqa: E402
+from mimic.commands.hand_reach import (  # noqa: E402
+    HandReach,
+    hand_reach,
+    plot_reach,
+    reach_lines,
+    reach_table,
+)
 from mimic.commands.printed import train_command  # noqa: E402
 from mimic.envs.config import EnvConfig  # noqa: E402
 from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402
@@ -43,6 +51,7 @@ class Inspection:
       warnings: reasons why the learner may imitate badly.
       reachable: distance that the learner can reach; None without `bound`.
       similarity: similarity of the nearest poses; None without `bound`.
+      reach: what the hand keeps; None without `bound`, or for an arm without a hand.
       command: command that trains the learner.
     """
 
@@ -54,6 +63,7 @@ class Inspection:
     warnings: list[str]
     reachable: arm_checks.ReachableDistance | None
     similarity: Mapping[str, Any] | None
+    reach: HandReach | None
     command: str
 
 
@@ -75,14 +85,14 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
     def run() -> None:
         console = Console()
         inspection = _inspect(config, env, expert, learner, demonstrations)
-        _print(console, inspection, expert, learner)
+        _print(console, inspection, expert, learner, is_searched=config.base == "auto")
         if out and scene:
             out.mkdir()
             home = [np.asarray(expert.embodiment.home), np.asarray(learner.embodiment.home)]
             with scene:
                 scene.fit([pose[None] for pose in home])
                 image = scene.image(home)
-            _save_picture(out / _PICTURE, image, expert, learner, env)
+            _save_picture(out / _PICTURE, image, expert, learner, env, inspection.reach)
             _write(out / _RESULTS, inspection, expert, learner)
             console.print(f"results: {out}", soft_wrap=True, highlight=False)
         console.print(f"train it: {inspection.command}", soft_wrap=True, highlight=False, markup=False)
@@ -95,25 +105,33 @@ def _inspect(
 ) -> Inspection:
     """Inspects the learner; computes its reachable distance on the demonstrations, if there are any."""
     stable_config, reason = arm_checks.stabilised(config.learner, learner, env)
-    reachable = similarity = None
+    reachable = similarity = reach = None
     if demonstrations is not None:
         reachable = arm_checks.reachable_distance(expert, learner, env, demonstrations)
         nearest = {"nearest_poses": reachable.nearest_qpos}
         similarity = pose_similarity(expert.embodiment, learner.embodiment, reachable.expert_qpos, nearest)
+        if all(arm.embodiment.hand_joint for arm in (expert, learner)):
+            base = "auto" if config.base == "auto" else base_numbers(config.base)
+            reach = hand_reach(config.expert, config.learner, env.metric, base)
     return Inspection(
         joints=_joints(learner, config.learner, env),
         links=_links(expert, learner, env),
         ends=[end.reason for end in learner.ends],
         ignored=list(learner.notes),
         assumed=list(arm_checks.assumptions(config.learner, learner)),
-        warnings=[*arm_checks.warnings(config.learner, learner), *([reason] if reason else [])],
+        warnings=[
+            *arm_checks.hand_doubts("expert", expert),
+            *arm_checks.warnings(config.learner, learner),
+            *([reason] if reason else []),
+        ],
         reachable=reachable,
         similarity=similarity,
+        reach=reach,
         command=train_command(dataclasses.replace(env, learner=stable_config)),
     )
 
 
-def _print(console: Console, inspection: Inspection, expert: Arm, learner: Arm) -> None:
+def _print(console: Console, inspection: Inspection, expert: Arm, learner: Arm, *, is_searched: bool) -> None:
     console.print(_headline(expert, learner), highlight=False, soft_wrap=True)
     console.print(_table(f"joints of {learner.embodiment.name}", inspection.joints))
     console.print(_table("links, and the expert links that they are compared with", inspection.links))
@@ -129,6 +147,11 @@ def _print(console: Console, inspection: Inspection, expert: Arm, learner: Arm) 
     if inspection.reachable is not None and inspection.similarity is not None:
         console.print(_distance_line(inspection.reachable, expert), highlight=False, soft_wrap=True)
         console.print(similarity_table(inspection.similarity))
+    if inspection.reach is not None:
+        pair = expert.embodiment, learner.embodiment
+        console.print(reach_table(inspection.reach, pair))
+        for line in reach_lines(inspection.reach, pair, is_searched=is_searched):
+            console.print(line, highlight=False, soft_wrap=True, markup=False)
 
 
 def _write(path: Path, inspection: Inspection, expert: Arm, learner: Arm) -> None:
@@ -146,6 +169,7 @@ def _write(path: Path, inspection: Inspection, expert: Arm, learner: Arm) -> Non
         "bound": reachable and reachable.bound,
         "hold": reachable and reachable.hold,
         "similarity": inspection.similarity,
+        "hand": inspection.reach and inspection.reach.summary(),
         "train": inspection.command,
     }
     path.write_text(json.dumps(results, indent=2) + "\n")
@@ -231,13 +255,27 @@ def _distance_line(reachable: arm_checks.ReachableDistance, expert: Arm) -> str:
     )
 
 
-def _save_picture(path: Path, image: np.ndarray, expert: Arm, learner: Arm, env: EnvConfig) -> None:
-    """Draws both arms in their start poses, and the correspondence of their links as a matrix of fractions."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 5.6), width_ratios=(1.35, 1), layout="constrained")
+def _save_picture(
+    path: Path, image: np.ndarray, expert: Arm, learner: Arm, env: EnvConfig, reach: HandReach | None
+) -> None:
+    """Draws both arms in their start poses, the correspondence of their links, and what the hand keeps, if known."""
+    rows = 1 if reach is None else 2
+    figure, axes = plt.subplots(
+        rows, 2, figsize=(13, 5.6 * rows), width_ratios=(1.35, 1), layout="constrained", squeeze=False
+    )
+    _draw_links(axes[0, 0], axes[0, 1], image, expert, learner, env)
+    if reach is not None:
+        plot_reach((axes[1, 0], axes[1, 1]), reach, (expert.embodiment, learner.embodiment))
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def _draw_links(left: Axes, right: Axes, image: np.ndarray, expert: Arm, learner: Arm, env: EnvConfig) -> None:
+    """Draws both arms, and the correspondence of their links as a matrix of fractions."""
     left.imshow(image)
     left.axis("off")
     names = f"{expert.embodiment.name} (expert), {learner.embodiment.name} (learner)"
-    left.text(0.5, -0.02, f"{names}; same colour: corresponding links", transform=left.transAxes, ha="center", va="top")
+    left.text(0.5, -0.02, f"{names}\nsame colour: corresponding links", transform=left.transAxes, ha="center", va="top")
     fractions = env.metric.link_fractions(expert.embodiment, learner.embodiment)
     right.imshow(fractions, cmap="Blues", vmin=0, vmax=1)
     for (row, column), fraction in np.ndenumerate(fractions):
@@ -248,5 +286,3 @@ def _save_picture(path: Path, image: np.ndarray, expert: Arm, learner: Arm, env:
     right.set_xticks(range(fractions.shape[1]), learner.embodiment.link_names, rotation=30, ha="right")
     right.set_yticks(range(fractions.shape[0]), expert.embodiment.link_names)
     right.set(xlabel="learner", ylabel="expert", title="which expert links a learner link is compared with")
-    figure.savefig(path, dpi=100)
-    plt.close(figure)

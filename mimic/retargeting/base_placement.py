@@ -10,7 +10,7 @@ from jaxtyping import Float
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints
 from mimic.metric.distance import Correspondence, Weights
-from mimic.retargeting.hand_target import Placement, placement
+from mimic.retargeting.hand_target import POSITION_TOLERANCE, Placement, placement
 from mimic.retargeting.pose import checked_poses, imitate_pose
 from mimic.retargeting.trajectory import imitate_trajectory
 
@@ -18,7 +18,8 @@ _FRAMES, _BASES, _ROUNDS = 16, 64, 3  # frames that judge a base, bases in each 
 _SPREAD = np.array([0.5, 0.5, 0.2, np.pi])  # of the first round: chain lengths of the expert, and rad
 _NARROWER = 0.35  # factor of the spread from one round to the next
 _BEST = 4  # bases that the next round starts from, and that are checked on a whole motion at the end
-_ROOM, _DISTANCE = 0.2, 0.3  # of the score: room in the joint ranges and embodiment distance; an exact hand has 1
+# Of the score: room in the joint ranges, embodiment distance, and the hand's position alone; an exact hand has 1.
+_ROOM, _DISTANCE, POSITION_ALONE = 0.2, 0.3, 0.3
 
 
 def find_base(
@@ -56,15 +57,7 @@ def find_base(
     paths = [checked_poses(expert, np.asarray(motion, np.float32), "motions", axes=("time",)) for motion in motions]
     frames = np.concatenate(paths)
     frames = frames[np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int)]
-    generator, spread = np.random.default_rng(seed), _SPREAD * np.array([*[float(expert.chain_length)] * 3, 1.0])
-    bases, scores = np.zeros((1, 4)), np.full(1, -np.inf)
-    for _ in range(_ROUNDS):
-        new = bases[np.arange(_BASES) % len(bases)] + generator.uniform(-spread, spread, (_BASES, 4))
-        new[0] = bases[0]
-        of_new = _scores(expert, learner, frames, new, correspondence, weights)
-        bases, scores = np.concatenate([bases, new]), np.concatenate([scores, of_new])
-        order = np.argsort(-scores, kind="stable")[:_BEST]
-        bases, scores, spread = bases[order], scores[order], spread * _NARROWER
+    bases = best_bases(expert, learner, frames, correspondence, weights, seed=seed)
     longest, best, options = max(paths, key=len), (-1.0, bases[0]), {"hand": "exact", "largest_jump": largest_jump}
     for base in bases:
         motion = imitate_trajectory(expert, learner, longest, correspondence, weights, base=base, **options)
@@ -77,6 +70,34 @@ def find_base(
     return best[1]
 
 
+def best_bases(
+    expert: Embodiment,
+    learner: Embodiment,
+    frames: Float[np.ndarray, "frames joints"],
+    correspondence: Correspondence,
+    weights: Weights,
+    *,
+    seed: int = 0,
+) -> Float[np.ndarray, "bases 4"]:
+    """The best bases that are found for single poses of the expert [rad], the first of them first; see `find_base`."""
+    generator, spread = np.random.default_rng(seed), _SPREAD * np.array([*[float(expert.chain_length)] * 3, 1.0])
+    bases, scores = np.zeros((1, 4)), np.full(1, -np.inf)
+    for _ in range(_ROUNDS):
+        new = bases[np.arange(_BASES) % len(bases)] + generator.uniform(-spread, spread, (_BASES, 4))
+        new[0] = bases[0]
+        of_new = _scores(expert, learner, frames, new, correspondence, weights)
+        bases, scores = np.concatenate([bases, new]), np.concatenate([scores, of_new])
+        order = np.argsort(-scores, kind="stable")[:_BEST]
+        bases, scores, spread = bases[order], scores[order], spread * _NARROWER
+    return bases
+
+
+def repeated(bases: Float[np.ndarray, "bases 4"], count: int) -> Placement:
+    """Placements of bases, each for a number of poses that follow each other."""
+    placements = [placement(base) for base in bases]
+    return Placement(*(np.repeat(np.stack(part, axis=-1), count, axis=-1) for part in zip(*placements, strict=True)))
+
+
 def _scores(
     expert: Embodiment,
     learner: Embodiment,
@@ -85,15 +106,13 @@ def _scores(
     correspondence: Correspondence,
     weights: Weights,
 ) -> Float[np.ndarray, " bases"]:
-    """Scores of bases: the mean over the frames of exact hands, room, and distance."""
+    """Scores of bases: the mean over the frames of exact hands, room, and distance, or of positions."""
     poses, count = np.tile(frames, (len(bases), 1)), len(bases)
-    placements = [placement(base) for base in bases]
-    stacked = Placement(
-        *(np.repeat(np.stack(part, axis=-1), len(frames), axis=-1) for part in zip(*placements, strict=True))
-    )
+    stacked = repeated(bases, len(frames))
     solution = jax.device_get(imitate_pose(expert, learner, poses, correspondence, weights, hand="exact", base=stacked))
     lower, upper = np.asarray(learner.joint_range).T
     room = 2 * np.minimum(solution.qpos - lower, upper - solution.qpos) / (upper - lower)
     room = np.where(continuous_joints(learner), 1, room).min(axis=-1)
-    score = np.where(solution.hand.exact, 1 + _ROOM * room - _DISTANCE * solution.distance, 0)
+    score = np.where(solution.hand.position <= POSITION_TOLERANCE, POSITION_ALONE, 0)
+    score = np.where(solution.hand.exact, 1 + _ROOM * room - _DISTANCE * solution.distance, score)
     return score.reshape(count, -1).mean(axis=-1)
