@@ -6,7 +6,6 @@ import json
 import shutil
 import sys
 from types import SimpleNamespace
-from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -23,63 +22,58 @@ from mimic.deploy.fake_robot import FakeRobot
 from mimic.deploy.policy import Policy
 from mimic.deploy.runner import run_controller
 from mimic.deploy.safety import INTERVENTIONS
-from mimic.envs.world_env import SENT_ACTIONS, HardwareEnv, control_observation
+from mimic.envs.world_env import SENT_ACTIONS, control_observation
 from mimic.evaluation.virtual_robot.episodes import Episodes
 from mimic.runs.checkpoints import load_checkpoint, save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.export.config import ExportConfig
 from mimic.trainers.export.export import prepare_export
-from mimic.trainers.export.export_controller import expert_table, export_controller, prepare_controller
+from mimic.trainers.export.export_controller import expert_table, prepare_controller
 from mimic.trainers.make import make_ppo_trainer
-from mimic.trainers.ppo.ppo import initial_params, make_controller, make_networks, params_template
-from mimic.trainers.ppo.trainer import PPOTrainer, run_environment
+from mimic.trainers.ppo.ppo import make_controller
 from mimic.trainers.run_config import load_config, save_config
-from mimic.trainers.run_models import save_models
+from tests.helpers.untrained_run import untrained_run
 
 pytest.importorskip("onnxruntime")
 HORIZON, HELD_OUT = 10, 3
 
 
-def untrained(folder, **settings):
-    """A run of a Panda with initial parameters."""
-    env = mimic.env_config(
-        "panda7dof", limits="hardware", horizon=HORIZON, demonstrations={"count": 2, "held_out": HELD_OUT}, **settings
-    )
-    config = TrainConfig(env, PPOConfig(hidden_layers=[8], preset="cpu"), compilation_cache="").resolve()
-    trainer = PPOTrainer(config, None)
-    folder.mkdir()
-    save_models(folder, config.env)
-    save_config(folder, dataclasses.replace(config, trainer=trainer.settings))
-    trainer.save_inputs(folder)
-    env = trainer.evaluator.env
-    networks = make_networks(trainer.settings, env.observation_size, env.action_size)
-    save_checkpoint(folder, 0, initial_params(networks, env.observation_size, jax.random.PRNGKey(0)))
-    return folder
+def run_of_a_panda(folder, **settings):
+    few = {"count": 2, "held_out": HELD_OUT}
+    env = mimic.env_config("panda7dof", limits="hardware", horizon=HORIZON, demonstrations=few, **settings)
+    return untrained_run(folder, env)
 
 
 @pytest.fixture(scope="module")
 def hardware_run(tmp_path_factory):
-    return untrained(tmp_path_factory.mktemp("runs") / "hardware", world="hardware")
+    """A run in the hardware world with random weights and statistics, its trainer, and its exported controller."""
+    folder = tmp_path_factory.mktemp("runs")
+    run_dir = run_of_a_panda(folder / "run", world="hardware")
+    trainer = make_ppo_trainer(load_config(run_dir), run_dir)
+    statistics, *networks = load_checkpoint(run_dir, trainer.params_template())[1]
+    rng, size = np.random.default_rng(0), trainer.evaluator.env.observation_size
+    statistics = statistics.replace(
+        mean=jnp.asarray(rng.normal(size=size), jnp.float32), std=jnp.asarray(rng.uniform(0.3, 2, size), jnp.float32)
+    )
+    save_checkpoint(run_dir, 1, (statistics, *networks))
+    prepare_export(ExportConfig(str(run_dir), str(folder / "controller"), "controller"))()
+    return run_dir, trainer, folder / "controller"
 
 
-@pytest.fixture(scope="module")
-def evaluation(hardware_run, tmp_path_factory):
-    """A function that evaluates the run in the hardware world, whose trainer and bundle are made once."""
-    trained = load_config(hardware_run)
-    trainer = make_ppo_trainer(trained, hardware_run)
-    exported = tmp_path_factory.mktemp("bundles") / "bundle"
-    export_controller(hardware_run, exported, 0)
+@pytest.fixture
+def evaluation(hardware_run, monkeypatch):
+    """A function that evaluates the run, whose controller was exported before."""
+    run_dir, trainer, controller = hardware_run
+    copy = lambda run_dir, folder, steps: shutil.copytree(controller, folder)  # noqa: E731
+    monkeypatch.setattr("mimic.trainers.export.export_controller.export_controller", copy)
 
     def run(out, **settings):
         settings = {"robot": "virtual_panda", "episodes": 4, **settings}
-        config = EvaluateConfig(str(hardware_run), out=str(out), compilation_cache="", **settings)
-        prepare_robot_evaluation(config, trained, trainer, hardware_run)()
+        config = EvaluateConfig(str(run_dir), out=str(out), compilation_cache="", **settings)
+        prepare_robot_evaluation(config, load_config(run_dir), trainer, run_dir)()
         return json.loads((out / "report.json").read_text())
 
-    with pytest.MonkeyPatch.context() as patch:
-        copy = lambda run_dir, folder, steps: shutil.copytree(exported, folder)  # noqa: E731
-        patch.setattr("mimic.trainers.export.export_controller.export_controller", copy)
-        yield run
+    return run
 
 
 def evaluate(run_dir, out, **settings):
@@ -111,7 +105,7 @@ def test_the_edges_of_the_world(evaluation, tmp_path):
 
 def test_the_gap_is_that_of_the_evaluator(hardware_run):
     """An arm that stays in its start pose has a gap of one, and one in the nearest poses that of the evaluator."""
-    evaluator = make_ppo_trainer(load_config(hardware_run), hardware_run).evaluator
+    evaluator = hardware_run[1].evaluator
     motion = np.arange(2, 2 + HELD_OUT)
     held = np.repeat(np.asarray(evaluator.env.start_poses)[motion][:, None], HORIZON, axis=1)
     zero, none = np.zeros(HELD_OUT), np.full(HELD_OUT, "", object)
@@ -125,35 +119,21 @@ def test_the_gap_is_that_of_the_evaluator(hardware_run):
     assert summary(evaluator, copied)["optimality_gap"] == pytest.approx(0, abs=1e-5)  # the expert has the same joints
 
 
-def test_a_controller_is_exported(hardware_run, tmp_path, capsys):
-    prepare_export(ExportConfig(str(hardware_run), str(tmp_path / "controller"), "controller"))()
-    bundle = load_bundle(tmp_path / "controller")
+def test_a_controller_is_exported(hardware_run):
+    bundle = load_bundle(hardware_run[2])
     assert bundle.mode == "joint_velocity" and bundle.ticks == HORIZON and bundle.joint_names[6] == "joint7"
     robot = FakeRobot(bundle.start_poses[0], bundle.limits)
     assert run_controller(robot, bundle, clock=robot).is_complete
-    assert "results: " in capsys.readouterr().out
 
 
-def test_an_exported_policy_is_the_policy(hardware_run, tmp_path):
-    """On observations at random, with random weights and statistics, at each tick and beyond the end of a motion."""
-    trained = load_config(hardware_run)
-    env = cast(HardwareEnv, run_environment(trained.env, hardware_run)[0])
-    settings = cast(PPOConfig, trained.trainer).resolve()
-    statistics, *networks = load_checkpoint(
-        hardware_run, params_template(settings, env.observation_size, env.action_size), 0
-    )[1]
-    rng = np.random.default_rng(0)
-    statistics = statistics.replace(
-        mean=jnp.asarray(rng.normal(size=env.observation_size), jnp.float32),
-        std=jnp.asarray(rng.uniform(0.3, 2, env.observation_size), jnp.float32),
-    )
-    params = (statistics, *networks)
-    shutil.copytree(hardware_run, tmp_path / "run")
-    save_checkpoint(tmp_path / "run", 1, params)
-    export_controller(tmp_path / "run", tmp_path / "controller")
-    bundle, motions = load_bundle(tmp_path / "controller"), [1, 0, 1]
-    policy = Policy(bundle, motions)
-    controller = make_controller(settings, env.observation_size, env.action_size)(params)
+def test_an_exported_policy_is_the_policy(hardware_run):
+    """On observations at random, at each tick and beyond the end of a motion."""
+    run_dir, trainer, exported = hardware_run
+    env, rng = trainer.evaluator.env, np.random.default_rng(0)  # its first motions are those of the training
+    params = load_checkpoint(run_dir, trainer.params_template())[1]
+    motions = [1, 0, 1]
+    policy = Policy(load_bundle(exported), motions)
+    controller = make_controller(trainer.settings, env.observation_size, env.action_size)(params)
     observe = jax.vmap(functools.partial(control_observation, env))
     act = jax.jit(lambda *parts: controller(SimpleNamespace(obs=observe(*parts))))
     past, table = np.zeros((3, SENT_ACTIONS * env.action_size), np.float32), expert_table(env)
@@ -182,12 +162,12 @@ def test_a_run_without_an_inner_loop_has_no_controller_and_no_robot(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"control": "torque"}, "got torque"),
-        ({"control_dt": 0.02}, "got 0.02 s"),  # as long as the latency
+        ({"world": "nominal", "control": "torque"}, "got torque"),
+        ({"world": "nominal", "control_dt": 0.02}, "got 0.02 s"),  # as long as the latency
     ],
 )
 def test_what_the_safety_layer_cannot_run_is_rejected(tmp_path, settings, message):
-    trained = TrainConfig(mimic.env_config("panda7dof", world="nominal", **settings), PPOConfig())
+    trained = TrainConfig(mimic.env_config("panda7dof", **settings), PPOConfig())
     save_config(tmp_path, trained)
     with pytest.raises(ValueError, match=message):
         prepare_controller(tmp_path)
@@ -204,11 +184,7 @@ def test_what_the_safety_layer_cannot_run_is_rejected(tmp_path, settings, messag
             "policy, hold or tracking for a run with an inner loop and control=joint_velocity",
         ),
         ({"world": "nominal", "control": "torque"}, "tracking", "policy or hold for a run with an inner loop and"),
-        (
-            {},
-            "tracking",
-            "policy, .*one_step or nearest_pose for a run with no inner loop",
-        ),
+        ({}, "tracking", "policy, .*one_step or nearest_pose for a run with no inner loop"),
     ],
 )
 def test_controllers_whose_commands_the_run_does_not_have(settings, controller, message):
@@ -219,7 +195,7 @@ def test_controllers_whose_commands_the_run_does_not_have(settings, controller, 
 @pytest.mark.slow
 def test_tracking_is_the_same_on_a_virtual_robot_as_in_the_environment(tmp_path):
     """Of nominal worlds, where nothing is random."""
-    run = untrained(tmp_path / "run", world="nominal", control="joint_position")
+    run = run_of_a_panda(tmp_path / "run", world="nominal", control="joint_position")
     row = evaluate(run, tmp_path / "virtual", controller="tracking")["cases"]["all ranges"]
     prepare_evaluation(
         EvaluateConfig(str(run), controller="tracking", out=str(tmp_path / "env"), compilation_cache=""), 0.0
@@ -229,9 +205,9 @@ def test_tracking_is_the_same_on_a_virtual_robot_as_in_the_environment(tmp_path)
     assert row["mean_distance"] == pytest.approx(report["mean_distance"]["held_out"], abs=0.02)
 
 
-def test_what_does_not_fit_is_rejected(reason, hardware_run, tmp_path):
-    run = f"run={hardware_run}"
-    cases = [
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
         (["robot=panda"], "robot: expected one of virtual_panda, virtual_robot, got 'panda'"),
         (["edges=true"], "robot_world, robot_loop, edges: expected only with robot="),
         (["robot=virtual_panda", "robot_loop=mars"], "robot_loop: expected one of mimic, ruckig"),
@@ -239,10 +215,10 @@ def test_what_does_not_fit_is_rejected(reason, hardware_run, tmp_path):
         (["robot=virtual_panda", "controller=pd"], "controller: expected policy or tracking with robot=, got pd"),
         (["robot=virtual_panda", "mass=1.2"], "expected none with robot="),
         (["robot=virtual_panda", "episodes=0"], "episodes: expected a whole number from 1"),
-    ]
-    for arguments, message in cases:
-        assert message in reason("evaluate", run, "compilation_cache=", *arguments)
-        (tmp_path / "empty").rmdir()
+    ],
+)
+def test_what_does_not_fit_is_rejected(reason, hardware_run, arguments, message):
+    assert message in reason("evaluate", f"run={hardware_run[0]}", "compilation_cache=", *arguments)
 
 
 def test_a_mapper_has_no_robot(reason, tmp_path):

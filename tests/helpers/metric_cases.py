@@ -2,6 +2,7 @@
 
 import functools
 
+import jax
 import numpy as np
 from jax.typing import DTypeLike
 
@@ -29,10 +30,13 @@ MEASURES: tuple[RotationMeasure, ...] = ("cosine", "angle")
 REDUCTIONS: tuple[Reduction, ...] = ("mean", "frobenius")
 
 
+_link_states = jax.jit(link_states)
+
+
 def states(arm, seed=0, dtype: DTypeLike = np.float32):
     rng = np.random.default_rng(seed)
     qpos, qvel = rng.uniform(-np.pi, np.pi, arm.num_joints), rng.uniform(-2, 2, arm.num_joints)
-    return link_states(arm, qpos.astype(dtype), qvel.astype(dtype))
+    return _link_states(arm, qpos.astype(dtype), qvel.astype(dtype))
 
 
 def planar_optimum(expert, learner, qpos):

@@ -5,18 +5,20 @@ import pytest
 from jax.typing import DTypeLike
 
 from mimic import motion_distance
-from mimic.arms.embodiment import LONG, panda, planar_arm
+from mimic.arms.embodiment import LONG, load_mjcf, panda, planar_arm
 from mimic.base import fused_kernel
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
 from mimic.metric.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
 from mimic.metric.kinematics import link_states
 from tests.helpers.lowering import gpu_program
 from tests.helpers.metric_cases import ALL_WEIGHTS, CORRESPONDENCES, EXPERT, LEARNER, WEIGHTS
+from tests.helpers.random_arms import random_arm
 
 PAIRS = {
     "panda 7->4": (panda(), panda(locked=(3, 6, 7))),
     "panda 4->7": (panda(locked=(3, 6, 7)), panda()),
     "planar": (EXPERT, LEARNER),
+    "random": (load_mjcf(random_arm(2)), load_mjcf(random_arm(1))),
     "long": (planar_arm(np.linspace(0.1, 0.3, LONG + 3)), planar_arm(np.linspace(0.2, 0.1, LONG))),
     # Links 1 of the locked arms are fixed to the base.
     "fixed links": (panda(locked=(1,), links="kept"), panda(locked=(1, 4), links="kept")),
@@ -47,15 +49,16 @@ def largest_difference(actual, expected):
     return max(float(np.abs(np.asarray(a, float) - np.asarray(b, float)).max()) for a, b in pairs)
 
 
-@pytest.mark.slow_for("long-paper", "panda 7->4-paper", "planar-all")
+@pytest.mark.slow_for("long-paper", "panda 7->4-paper", "panda 4->7-static", "planar-all", "fixed links-all")
 @pytest.mark.parametrize(
     ("pair", "weights"),
     [
         ("panda 7->4", "paper"),
+        ("random", "static"),
         ("panda 4->7", "static"),
         ("planar", "all"),
         ("long", "paper"),
-        pytest.param("fixed links", "all", marks=pytest.mark.slow),
+        ("fixed links", "all"),
     ],
 )
 def test_value_and_gradient_equal_those_of_the_composition(x64, pair, weights):
@@ -74,20 +77,21 @@ def test_other_metrics_equal_the_composition(x64, correspondence, weights):
     sample = [x[0] for x in motions(arms)]
     several: tuple[dict, ...] = {}, {"rotation": "angle"}, {"reduction": "frobenius"}
     for options in several:
-        actual = motion_distance(*arms, *metric, **options)(*sample)
-        np.testing.assert_allclose(actual, composed(arms, *metric, **options)(*sample), rtol=1e-13)  # rounding
+        functions = motion_distance(*arms, *metric, **options), composed(arms, *metric, **options)
+        actual, expected = (jax.jit(function)(*sample) for function in functions)
+        np.testing.assert_allclose(actual, expected, rtol=1e-13)  # rounding
 
 
 def test_gradients_equal_finite_differences(x64):
     arms, step = (EXPERT, LEARNER), 1e-6  # the error of the difference, step^2, against that of rounding, 1e-16 / step
-    distance = motion_distance(*arms, overlap_correspondence(*arms), ALL_WEIGHTS)
-    sample = [x[0] for x in motions(arms)]
-    for index, gradient in enumerate(jax.grad(distance, ALL_ARGUMENTS)(*sample)):
+    distance = jax.jit(motion_distance(*arms, overlap_correspondence(*arms), ALL_WEIGHTS))
+    sample = [np.asarray(x[0]) for x in motions(arms)]
+    for index, gradient in enumerate(jax.jit(jax.grad(distance, ALL_ARGUMENTS))(*sample)):
 
         def along(values, index=index):
-            return distance(*sample[:index], values, *sample[index + 1 :])
+            return float(distance(*sample[:index], values, *sample[index + 1 :]))
 
-        shifts = step * jnp.eye(sample[index].size)
+        shifts = step * np.eye(sample[index].size)
         expected = [(along(sample[index] + s) - along(sample[index] - s)) / (2 * step) for s in shifts]
         np.testing.assert_allclose(gradient, expected, rtol=1e-6, atol=1e-8)
 
@@ -117,11 +121,13 @@ def test_one_expert_pose_serves_a_batch_of_learners():
     arms = EXPERT, LEARNER
     distance = motion_distance(*arms, overlap_correspondence(*arms))
     qpos, qvel, *learner = motions(arms, dtype=np.float32)
-    actual = jax.vmap(distance, in_axes=(None, None, 0, 0))(qpos[0], qvel[0], *learner)
-    every = jax.vmap(jax.vmap(distance, in_axes=(None, None, 0, 0)), in_axes=(0, 0, None, None))(qpos, qvel, *learner)
-    expected = [distance(qpos[0], qvel[0], *(x[k] for x in learner)) for k in range(5)]
+    one = jax.vmap(distance, in_axes=(None, None, 0, 0))
+    actual = jax.jit(one)(qpos[0], qvel[0], *learner)
+    every = jax.jit(jax.vmap(one, in_axes=(0, 0, None, None)))(qpos, qvel, *learner)
+    alone = jax.jit(distance)
+    expected = [alone(qpos[0], qvel[0], *(x[k] for x in learner)) for k in range(5)]
     np.testing.assert_allclose(actual, expected, rtol=1e-6)  # float32, fused and not
-    np.testing.assert_array_equal(distance(qpos[0], qvel[0], *learner), actual)
+    np.testing.assert_allclose(distance(qpos[0], qvel[0], *learner), actual, rtol=1e-6)
     np.testing.assert_allclose(every[0], expected, rtol=1e-6)
 
 
@@ -158,10 +164,10 @@ def test_dtypes_are_kept(x64, pair):
     distance = motion_distance(*arms, overlap_correspondence(*arms))
     for dtype in (np.float32, np.float64):
         sample = [x[0] for x in motions(arms, dtype=dtype)]
-        value, gradient = jax.value_and_grad(distance, 2)(*sample)
+        value, gradient = jax.jit(jax.value_and_grad(distance, 2))(*sample)
         assert value.dtype == gradient.dtype == dtype
         assert {leaf.dtype for leaf in jax.tree.leaves(link_states(arms[0], sample[0], sample[1]))} == {np.dtype(dtype)}
-    mixed = distance(*sample[:2], *(np.asarray(x, np.float32) for x in sample[2:]))
+    mixed = jax.eval_shape(distance, *sample[:2], *(np.asarray(x, np.float32) for x in sample[2:]))
     assert mixed.dtype == np.float64
 
 
@@ -214,7 +220,7 @@ def test_the_kernel_equals_the_plain_function(count):
 
     rows = [jnp.asarray(x, jnp.float32) for x in np.random.default_rng(0).normal(size=(2, count, 2))]
     actual = jax.jit(lambda *rows: fused_kernel.gpu_kernel(program, (1, 3))(*rows))(*rows)
-    expected = jax.vmap(fused_kernel.fused(program, (1, 3)))(*rows)
+    expected = jax.jit(jax.vmap(fused_kernel.fused(program, (1, 3))))(*rows)
     for values, reference, width in zip(actual, expected, (1, 3), strict=True):
         assert values.shape == (count, width)
         np.testing.assert_allclose(values, reference, rtol=1e-6)  # float32, fused and not

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from mimic.motions.mocap.arms import find_arms
 from mimic.motions.mocap.conventions import UNITS, UPS, z_up
-from mimic.motions.mocap.points import ArmPoints
+from mimic.motions.mocap.points import ArmPoints, PointMotion
 from mimic.motions.mocap.reading import read_motion
 from tests.helpers.bodies import RATE, bvh_text, person
 
@@ -27,94 +27,84 @@ def _bvh(tmp_path, text, name="clip.bvh"):
     return path
 
 
+def _npz(tmp_path, positions, names, **content):
+    """Writes points at the rate of the person, or at the times or the rate in `content`."""
+    rate = {} if "time" in content else {"rate": RATE}
+    np.savez(tmp_path / "p.npz", names=np.array(names), positions=positions, **{**rate, **content})
+    return tmp_path / "p.npz"
+
+
 def _assert_person(motion, expected):
     for name in expected.names:
         np.testing.assert_allclose(motion.point(name), expected.point(name), atol=1e-6)
     assert motion.rate == pytest.approx(RATE, rel=1e-6)
 
 
-@pytest.mark.parametrize("unit", ["m", "cm", "cmu"])
-def test_bvh_in_each_unit(tmp_path, expected, unit):
-    motion = read_motion(_bvh(tmp_path, bvh_text(SAMPLES, unit=UNITS[unit])))
-    _assert_person(motion, expected)
-    assert f"unit: {unit}, found from the length of the arms" in motion.notes
-    assert "up: y, from the feet to the head" in motion.notes
+def _other_layout(text):
+    """Braces on the line of a name, and another ending of lines."""
+    return text.replace("\n{", " {").replace("\n", "\r\n")
 
 
-def test_angles_that_jump_by_a_full_turn_change_nothing(tmp_path, expected):
-    _assert_person(read_motion(_bvh(tmp_path, bvh_text(SAMPLES, turns=True))), expected)
+FRAMES = f"the header states {SAMPLES - 1} frames, the file has {SAMPLES}"
 
 
-def test_a_wrong_number_of_frames_is_noted(tmp_path, expected):
-    motion = read_motion(_bvh(tmp_path, bvh_text(SAMPLES, frames=SAMPLES - 1)))
-    _assert_person(motion, expected)
-    assert f"the header states {SAMPLES - 1} frames, the file has {SAMPLES}" in motion.notes
-
-
-def test_braces_on_the_line_of_a_name_and_names_with_spaces(tmp_path):
-    text = (
-        bvh_text(SAMPLES).replace("\n{", " {").replace("ROOT Hips", "ROOT mixamorig:Hips of Bob").replace("\n", "\r\n")
-    )
+@pytest.mark.parametrize(
+    ("text", "note"),
+    [
+        *((bvh_text(SAMPLES, unit=UNITS[unit]), f"unit: {unit}, found from the length of the arms")
+          for unit in ("m", "cm", "cmu")),
+        (bvh_text(SAMPLES, turns=True), "up: y, from the feet to the head"),  # angles that jump by a full turn
+        (bvh_text(SAMPLES, frames=SAMPLES - 1), FRAMES),
+        (_other_layout(bvh_text(SAMPLES)), "up: y, from the feet to the head"),
+    ],
+    ids=["m", "cm", "cmu", "turns", "frames", "layout"],
+)  # fmt: skip
+def test_bvh(tmp_path, expected, text, note):
     motion = read_motion(_bvh(tmp_path, text))
-    assert motion.names[0] == "mixamorig:Hips of Bob"
-    np.testing.assert_allclose(motion.positions, read_motion(_bvh(tmp_path, bvh_text(SAMPLES))).positions)
+    _assert_person(motion, expected)
+    assert note in motion.notes
 
 
-@pytest.mark.parametrize("up", UPS)
-def test_each_axis_can_be_up(up):
-    turned = z_up(np.eye(3), up)  # rows are the images of x, y, z
-    assert np.linalg.det(turned) == pytest.approx(1)
-    sign = -1 if up.startswith("-") else 1
-    np.testing.assert_array_equal(turned["xyz".index(up[-1])] * sign, [0, 0, 1])
+def test_names_with_spaces(tmp_path):
+    text = bvh_text(5).replace("ROOT Hips", "ROOT mixamorig:Hips of Bob")
+    assert read_motion(_bvh(tmp_path, text)).names[0] == "mixamorig:Hips of Bob"
 
 
 @pytest.mark.parametrize("up", UPS)
 def test_up_is_found_from_the_body(tmp_path, expected, up):
-    rotated = expected.positions @ z_up(np.eye(3), up).T  # undoes z_up
-    np.savez(tmp_path / "p.npz", names=np.array(expected.names), positions=rotated, rate=RATE)
-    motion = read_motion(tmp_path / "p.npz")
+    turned = z_up(np.eye(3), up)  # rows are the images of x, y, z
+    assert np.linalg.det(turned) == pytest.approx(1)
+    sign = -1 if up.startswith("-") else 1
+    np.testing.assert_array_equal(turned["xyz".index(up[-1])] * sign, [0, 0, 1])
+    motion = read_motion(_npz(tmp_path, expected.positions @ turned.T, expected.names))  # undoes z_up
     guess = "" if up in ("y", "z", "-y") else ": a guess, capture.up= sets it"
     assert f"up: {up}, from the feet to the head{guess}" in motion.notes
     np.testing.assert_allclose(motion.positions, expected.positions, atol=1e-9)
 
 
-def test_csv(tmp_path, expected):
-    header = ",".join(["time", *(f"{name}_{axis}" for name in expected.names for axis in "xyz")])
-    rows = np.concatenate([np.arange(SAMPLES)[:, None] / RATE, expected.positions.reshape(SAMPLES, -1)], axis=1)
-    path = tmp_path / "clip.csv"
-    np.savetxt(path, rows, delimiter=",", header=header, comments="")
-    _assert_person(read_motion(path), expected)
-    assert set(find_arms(read_motion(path))) == {"left", "right"}  # without parents, by the names alone
+@pytest.mark.parametrize(("separator", "time"), [(",", "time"), (";", "Time (s)")])
+def test_csv(tmp_path, expected, separator, time):
+    """A cell without a number is a point that was not seen."""
+    header = [time, *(f"{name}_{axis}" for name in expected.names for axis in "xyz")]
+    values = np.concatenate([np.arange(SAMPLES)[:, None] / RATE, expected.positions.reshape(SAMPLES, -1)], axis=1)
+    rows = [header, *(list(map(str, row)) for row in values)]
+    rows[8][1:4] = "---"
+    (tmp_path / "clip.csv").write_text("\n".join(map(separator.join, rows)))
+    motion, seen = read_motion(tmp_path / "clip.csv"), expected.positions.copy()
+    seen[7, 0] = np.nan
+    _assert_person(motion, dataclasses.replace(expected, positions=seen))
+    assert set(find_arms(motion)) == {"left", "right"}  # without parents, by the names alone
 
 
-def test_trc(tmp_path, expected):
+@pytest.mark.parametrize("separator", ["\t", ","])
+def test_trc(tmp_path, expected, separator):
     names = ("LSHO", "LELB", "LWRA", "LWRB", "LFIN")
     wrist = expected.point("LeftHand")
-    tracks = [
-        expected.point("LeftArm"),
-        expected.point("LeftForeArm"),
-        wrist + 0.02,
-        wrist - 0.02,
-        expected.point(ARM[3]),
-    ]
-    values = np.stack(tracks, axis=1)[..., [1, 2, 0]] * 1000  # y up, mm
-    lines = [
-        "PathFileType\t4\t(X/Y/Z)\tclip.trc",
-        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
-        f"{RATE}\t{RATE}\t{SAMPLES}\t{len(names)}\tmm\t{RATE}\t1\t{SAMPLES}",
-        "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t",
-        "\t\t" + "\t".join(f"X{i}\tY{i}\tZ{i}" for i in range(1, 6)),
-    ]
-    for sample, row in enumerate(values.reshape(SAMPLES, -1)):
-        cells = [f"{value:.6f}" for value in row]
-        if sample == 3:
-            cells[:3] = ["", "", ""]  # a marker that was not seen
-        lines.append("\t".join([str(sample + 1), f"{sample / RATE:.7f}", *cells]))
-    path = tmp_path / "clip.trc"
-    path.write_text("\n".join(lines))
-    motion = read_motion(path)
-    assert np.isnan(motion.positions[3, 0]).all() and np.isfinite(motion.positions[3, 1:]).all()
-    np.testing.assert_allclose(motion.point("LELB"), expected.point("LeftForeArm"), atol=1e-6)
+    tracks = [expected.point(ARM[0]), expected.point(ARM[1]), wrist + 0.02, wrist - 0.02, expected.point(ARM[3])]
+    written = PointMotion(names, (-1,) * 5, np.stack(tracks, axis=1), RATE)
+    written.positions[3, 0] = np.nan
+    motion = read_motion(_trc(tmp_path / "clip.trc", written, separator=separator))
+    np.testing.assert_allclose(motion.positions, written.positions, atol=1e-6)
     arm = find_arms(motion)["left"]
     assert (arm.shoulder, arm.elbow, arm.wrist, arm.hand) == (("LSHO",), ("LELB",), ("LWRA", "LWRB"), ("LFIN",))
 
@@ -129,8 +119,7 @@ def test_trc(tmp_path, expected):
     ],
 )
 def test_a_stated_unit_is_checked(tmp_path, expected, unit, message):
-    path = tmp_path / "p.npz"
-    np.savez(path, names=np.array(expected.names), positions=expected.positions, rate=RATE, unit=np.array(unit))
+    path = _npz(tmp_path, expected.positions, expected.names, unit=np.array(unit))
     if message is None:
         return _assert_person(read_motion(path), expected)
     with pytest.raises(ValueError, match=message):
@@ -150,8 +139,7 @@ def test_a_length_of_two_units_is_not_guessed(tmp_path, expected):
 def test_uneven_times_are_resampled(tmp_path, expected):
     time = np.arange(SAMPLES) / RATE
     keep = np.delete(np.arange(SAMPLES), [20])
-    np.savez(tmp_path / "p.npz", names=np.array(expected.names), positions=expected.positions[keep], time=time[keep])
-    motion = read_motion(tmp_path / "p.npz")
+    motion = read_motion(_npz(tmp_path, expected.positions[keep], expected.names, time=time[keep]))
     assert len(motion.positions) == SAMPLES and np.isnan(motion.positions[20]).all()
     known = np.isfinite(motion.positions).all(axis=(1, 2))
     assert known.sum() >= SAMPLES - 2
@@ -185,26 +173,6 @@ def test_arguments_are_checked(tmp_path):
         read_motion(_bvh(tmp_path, "", "clip.fbx"))
     with pytest.raises(ValueError, match="unit: .*mile"):
         read_motion(_bvh(tmp_path, bvh_text(5)), unit="mile")
-
-
-def test_c3d(tmp_path, expected):
-    ezc3d = pytest.importorskip("ezc3d", reason="the extra [mocap] is not installed")
-    names = ["LSHO", "LELB", "LWRA", "LFIN"]
-    tracks = np.stack([expected.point(name) for name in ARM], axis=1)
-    points = np.ones((4, len(names), SAMPLES))
-    points[:3] = np.moveaxis(tracks, -1, 0).swapaxes(1, 2) * 1000
-    points[:, 1, 5] = np.nan
-    file = ezc3d.c3d()
-    file["parameters"]["POINT"]["RATE"]["value"] = [RATE]
-    file["parameters"]["POINT"]["LABELS"]["value"] = names
-    file["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
-    file["data"]["points"] = points
-    file.write(str(tmp_path / "clip.c3d"))
-    motion = read_motion(tmp_path / "clip.c3d")
-    assert motion.names == tuple(names) and motion.rate == RATE
-    assert np.isnan(motion.positions[5, 1]).all()
-    known = np.arange(SAMPLES) != 5
-    np.testing.assert_allclose(motion.positions[known], tracks[known], atol=1e-6)
 
 
 def test_a_damaged_c3d_cannot_end_the_process(tmp_path):
@@ -268,45 +236,24 @@ def test_rounded_times_are_those_of_the_stated_rate(tmp_path, expected, digits, 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e9, "nanoseconds")])
 def test_times_in_smaller_units(tmp_path, expected, factor, unit):
-    np.savez(
-        tmp_path / "p.npz", names=np.array(expected.names), positions=expected.positions,
-        time=np.arange(SAMPLES) / RATE * factor + 1e6 * factor,
-    )  # fmt: skip
-    motion = read_motion(tmp_path / "p.npz")
+    time = np.arange(SAMPLES) / RATE * factor + 1e6 * factor
+    motion = read_motion(_npz(tmp_path, expected.positions, expected.names, time=time))
     assert motion.rate == pytest.approx(RATE, rel=1e-6) and f"time: taken for {unit}" in motion.notes
 
 
-def test_separators_and_cells_without_numbers(tmp_path, expected):
-    markers = _markers(expected, MARKERS)
-    motion = read_motion(_trc(tmp_path / "clip.trc", markers, separator=","))
-    np.testing.assert_allclose(motion.positions, markers.positions, atol=1e-6)
-    header = ";".join(["Time (s)", *(f"{name}_{axis}" for name in markers.names for axis in "xyz")])
-    rows = [f"{i / RATE};" + ";".join(map(str, row)) for i, row in enumerate(markers.positions.reshape(SAMPLES, -1))]
-    rows[7] = f"{7 / RATE};-;-;-;" + rows[7].split(";", 4)[4]
-    (tmp_path / "clip.csv").write_text("\n".join([header, *rows]))
-    motion = read_motion(tmp_path / "clip.csv")
-    assert np.isnan(motion.positions[7, 0]).all() and np.isfinite(motion.positions).sum() == motion.positions.size - 3
-
-
-def test_a_person_who_lies_or_stands_on_the_hands_is_not_turned(tmp_path):
-    for name, turn, seen in (("lying", "0 90 0", "-x"), ("handstand", "180 0 0", "-y")):
-        text = bvh_text(SAMPLES)
-        root = ("0.0 95.0 0.0 " + "0.000000000 0.000000000 0.000000000").split()
-        lines = text.splitlines()
-        start = next(i for i, line in enumerate(lines) if line.startswith("Frame Time")) + 1
-        lines[start:] = [" ".join([*root[:3], *turn.split(), *line.split()[6:]]) for line in lines[start:]]
-        motion = read_motion(_bvh(tmp_path, "\n".join(lines), f"{name}.bvh"))
-        assert motion.notes[0].startswith("up: y, as usual for such files, though the body is along"), (name, seen)
+@pytest.mark.parametrize("turn", ["0 90 0", "180 0 0"], ids=["lying", "handstand"])
+def test_a_person_who_lies_or_stands_on_the_hands_is_not_turned(tmp_path, turn):
+    head, _, rows = bvh_text(SAMPLES).partition("MOTION\n")
+    states, step, *frames = rows.splitlines()
+    frames = [" ".join(["0 95 0", turn, *frame.split()[6:]]) for frame in frames]
+    motion = read_motion(_bvh(tmp_path, "\n".join([f"{head}MOTION", states, step, *frames])))
+    assert motion.notes[0].startswith("up: y, as usual for such files, though the body is along")
 
 
 def test_a_person_who_leans_far_is_a_guess(tmp_path, expected):
-    leaning = (
-        Rotation.from_euler("x", 50, degrees=True)
-        .apply(expected.positions.reshape(-1, 3))
-        .reshape(expected.positions.shape)
-    )
-    np.savez(tmp_path / "p.npz", names=np.array(expected.names), positions=leaning, rate=RATE)
-    (note,) = (note for note in read_motion(tmp_path / "p.npz").notes if note.startswith("up: "))
+    leaning = Rotation.from_euler("x", 50, degrees=True).as_matrix()
+    motion = read_motion(_npz(tmp_path, expected.positions @ leaning.T, expected.names))
+    (note,) = (note for note in motion.notes if note.startswith("up: "))
     assert note.endswith("a guess, capture.up= sets it")
 
 
@@ -314,8 +261,7 @@ def test_exchanged_markers_are_left_out(tmp_path, expected):
     elbow, wrist = expected.names.index("LeftForeArm"), expected.names.index("LeftHand")
     positions = expected.positions.copy()
     positions[20:30, [elbow, wrist]] = positions[20:30, [wrist, elbow]]
-    np.savez(tmp_path / "p.npz", names=np.array(expected.names), positions=positions, rate=RATE)
-    motion = read_motion(tmp_path / "p.npz")
+    motion = read_motion(_npz(tmp_path, positions, expected.names))
     assert any(note.startswith("left out: 10 samples at which an arm's length") for note in motion.notes)
     assert np.isnan(motion.positions[20:30, elbow]).all()
     np.testing.assert_allclose(np.delete(motion.point("LeftHand"), range(20, 30), axis=0),
@@ -332,13 +278,16 @@ def test_up_of_markers_that_were_seen(tmp_path, expected):
     assert motion.notes == ("up: y, from the hips to the neck",)
 
 
-def test_up_that_the_file_states_where_the_body_shows_none(tmp_path, expected):
-    arms = expected.select(ARM)
-    for stated, found in (("y", "up: y, as the file states"), ("", "up: z, as usual for such files: a guess")):
-        content = {"up": np.array(stated)} if stated else {}
-        path = tmp_path / f"p{stated}.npz"
-        np.savez(path, names=np.array(ARM), positions=arms.positions, rate=np.array([RATE]), **content)
-        assert any(note.startswith(found) for note in read_motion(path).notes)
+@pytest.mark.parametrize(
+    ("content", "note"),
+    [
+        ({"up": np.array("y")}, "up: y, as the file states"),
+        ({}, "up: z, as usual for such files: a guess"),
+    ],
+)
+def test_up_that_the_file_states_where_the_body_shows_none(tmp_path, expected, content, note):
+    motion = read_motion(_npz(tmp_path, expected.select(ARM).positions, ARM, **content))
+    assert any(line.startswith(note) for line in motion.notes)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -346,10 +295,8 @@ def test_mirrored_points_are_named(tmp_path, expected, mirrored):
     feet = {side: expected.point(f"{side}Foot") + [0.15, 0, -0.04] for side in ("Left", "Right")}
     positions = np.concatenate([expected.positions, np.stack(list(feet.values()), axis=1)], axis=1)
     positions = positions * [1, -1 if mirrored else 1, 1]
-    np.savez(
-        tmp_path / "p.npz", names=np.array([*expected.names, "LeftToe", "RightToe"]), positions=positions, rate=RATE
-    )
-    assert any("toes point backwards" in note for note in read_motion(tmp_path / "p.npz").notes) is mirrored
+    motion = read_motion(_npz(tmp_path, positions, [*expected.names, "LeftToe", "RightToe"]))
+    assert any("toes point backwards" in note for note in motion.notes) is mirrored
 
 
 def test_one_of_several_persons_is_read(tmp_path, expected):
@@ -388,19 +335,33 @@ def test_points_that_the_user_names(tmp_path, expected):
         read_motion(path, arm=ArmPoints("left", ("p9",), (), (), ()))
 
 
-def test_c3d_with_many_labels_outputs_of_models_and_a_vertical(tmp_path, expected):
+def _c3d(path, points, **labels):
+    """Writes points [samples, points, 3] [mm] as C3D, with lists of words of the group POINT."""
     ezc3d = pytest.importorskip("ezc3d", reason="the extra [mocap] is not installed")
-    names = [*(f"X{i}" for i in range(260)), *(MARKERS[joint] for joint in list(MARKERS)[:6]), "LShoulderAngles"]
-    points = np.ones((4, len(names), 3))
-    points[:3] = np.random.default_rng(0).uniform(0, 900, (3, len(names), 3))
-    points[:3, 260:266] = 1000 * np.moveaxis(_markers(expected, MARKERS).positions[:3, :6], -1, 0).swapaxes(1, 2)
     file = ezc3d.c3d()
-    labels = {"LABELS": names[:255], "LABELS2": names[255:], "ANGLES": names[-1:], "UNITS": ["mm"], "Y_SCREEN": ["-Y"]}
-    for key, value in labels.items():
+    for key, value in {"UNITS": ["mm"], **labels}.items():
         file.add_parameter("POINT", key, value)
     file["parameters"]["POINT"]["RATE"]["value"] = [RATE]
-    file["data"]["points"] = points
-    file.write(str(tmp_path / "clip.c3d"))
-    motion = read_motion(tmp_path / "clip.c3d")
+    file["data"]["points"] = np.ones((4, points.shape[1], len(points)))
+    file["data"]["points"][:3] = points.transpose(2, 1, 0)
+    file.write(str(path))
+    return read_motion(path)
+
+
+def test_c3d(tmp_path, expected):
+    names = ["LSHO", "LELB", "LWRA", "LFIN"]
+    tracks = np.stack([expected.point(name) for name in ARM], axis=1)
+    tracks[5, 1] = np.nan
+    motion = _c3d(tmp_path / "clip.c3d", 1000 * tracks, LABELS=names)
+    assert motion.names == tuple(names) and motion.rate == RATE
+    np.testing.assert_allclose(motion.positions, tracks, atol=1e-6)
+
+
+def test_c3d_with_many_labels_outputs_of_models_and_a_vertical(tmp_path, expected):
+    names = [*(f"X{i}" for i in range(260)), *(MARKERS[joint] for joint in list(MARKERS)[:6]), "LShoulderAngles"]
+    points = np.random.default_rng(0).uniform(0, 900, (3, len(names), 3))
+    points[:, 260:266] = 1000 * _markers(expected, MARKERS).positions[:3, :6]
+    labels = {"LABELS": names[:255], "LABELS2": names[255:], "ANGLES": names[-1:], "Y_SCREEN": ["-Y"]}
+    motion = _c3d(tmp_path / "clip.c3d", points, **labels)
     assert motion.names == tuple(names[:-1]) and motion.notes == ("up: y, as the file states",)
     assert set(find_arms(motion)) == {"left", "right"}
