@@ -33,8 +33,7 @@ def expand_arms(arguments: Sequence[str], command: str) -> list[str]:
         key, equals, value = argument.partition("=")
         name = key.removeprefix(_PREFIXES[command])
         role, dot, field = name.partition(".")
-        # In a training that starts from a run, `learner` is the one arm of many that it goes on with.
-        if not equals or role not in ROLES or (command == "train" and key == "learner" and {"init", "resume"} & keys):
+        if not equals or role not in ROLES:
             others.append(argument)
             continue
         if command == "view" and {*_OWN_ARMS} & keys:

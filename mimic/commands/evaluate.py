@@ -13,12 +13,12 @@ from mimic.base.config import new_folder
 from mimic.base.distribution import install_command
 from mimic.commands.config import CONTROLLERS, EvaluateConfig
 from mimic.envs.config import EnvConfig
+from mimic.envs.family import with_one_learner
 from mimic.motions.demonstrations import Demonstrations, load_demonstrations
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.fine_tuning import with_one_learner
 from mimic.trainers.make import make_ppo_trainer, make_trainer
 from mimic.trainers.report import make_report, show_report
 from mimic.trainers.run_config import load_config, save_config

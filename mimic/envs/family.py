@@ -1,13 +1,14 @@
 """The arms of an environment whose learner is drawn for each episode: its sampler, and the arms of its report."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, lock_joints
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, lock_joints, masked_arrays
 from mimic.arms.sampler import (
     Sampler,
     limited_sampler,
@@ -120,6 +121,24 @@ def report_arms(config: EnvConfig) -> dict[str, dict[str, ArmArrays]]:
         for i in range(_RANDOM_ARMS):
             result[UNSEEN][f"random {i}"] = jax.tree.map(lambda x, i=i: x[i], drawn)
     return result
+
+
+def with_one_learner(env: EnvConfig, model: str, locked: Sequence[int | str]) -> EnvConfig:
+    """The environment of one learner with all else as in the environment of many arms.
+
+    Args:
+      env: the environment of a run of many arms.
+      model: the learner, see `ArmConfig.model`.
+      locked: its locked joints, by number or name.
+
+    Raises:
+      ValueError: there is no such arm, or a policy of many arms cannot move it.
+    """
+    learner = dataclasses.replace(_model(arms_config(env), model), locked=list(locked) or None)
+    label = "-".join([env.name, arm_name(learner), *(["locked", *map(str, locked)] if locked else [])])
+    config = dataclasses.replace(env, name=label, arms=None, learner=learner, physics="auto")
+    masked_arrays(learner, config.limits, config.metric.links)
+    return config
 
 
 def arm_name(model: ArmConfig) -> str:

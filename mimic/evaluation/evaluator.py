@@ -160,16 +160,9 @@ class Evaluator:
         demonstrations = self.env.demonstrations
         return Evaluator(self.env.with_demonstrations(demonstrations.select([])), demonstrations.select([index]))
 
-    def rollout(
-        self, controller: Controller | ControllerWithMemory, demonstrations: Demonstrations | None = None
-    ) -> Rollouts:
-        """Runs a controller on every demonstration. Call it under `jax.jit`.
-
-        Args:
-          controller: the controller.
-          demonstrations: others than those of the evaluator.
-        """
-        env = self.env if demonstrations is None else self.env.with_demonstrations(demonstrations)
+    def rollout(self, controller: Controller | ControllerWithMemory) -> Rollouts:
+        """Runs a controller on every demonstration. Call it under `jax.jit`."""
+        env = self.env
         if not isinstance(controller, ControllerWithMemory):
             function = controller
             controller = ControllerWithMemory(lambda state: (), lambda state, memory: (function(state), memory))

@@ -363,8 +363,6 @@ class TrainConfig:
       run_dir: folder that the run writes to; runs/ENV-TRAINER-seedSEED-TIME where empty.
       resume: run directory of the run to continue.
       init: run directory of another run; training starts from the parameters of its last checkpoint.
-      learner: with `init`, a run of many arms: name or file of the one arm that training then goes on with, see
-        `fine_tuned` in mimic/trainers/fine_tuning.py.
       logger: "local", "wandb", "mlflow", or a list of these: services that metrics are sent to. The run directory
         always has the metrics.
       compilation_cache: folder where JAX keeps compiled functions between runs; none where empty.
@@ -377,18 +375,12 @@ class TrainConfig:
     run_dir: str = ""
     resume: str = ""
     init: str = ""
-    learner: str = ""
     logger: Any = "local"
     compilation_cache: str = "~/.cache/mimic/jax"
     distributed: DistributedConfig = dataclasses.field(default_factory=DistributedConfig)
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        if self.learner and not self.init:
-            raise ValueError(
-                f"learner: expected with init=DIR of a run of many arms, got {self.learner!r} without it; env.learner "
-                "is the learner of an environment"
-            )
         for name in self.loggers:
             check_choice("logger", name, LOGGERS)
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import jax
 
 from mimic.base import compat, registry
+from mimic.envs.family import with_one_learner
 from mimic.motions.demonstrations import Demonstrations
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.fine_tuning import with_one_learner
 from mimic.trainers.trainer import Trainer
 
 if TYPE_CHECKING:

@@ -34,7 +34,6 @@ from mimic.runs.provenance import hardware
 from mimic.runs.signals import Interrupted, Signals, noted_signals
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.fine_tuning import fine_tuned
 from mimic.trainers.make import make_trainer
 from mimic.trainers.progress import TrainingProgress
 from mimic.trainers.report import make_report, show_report
@@ -80,8 +79,6 @@ def prepare_training(
     if resumed_dir:
         config = _resumed_config(resumed_dir, config, overrides)
         check_writable("resume", resumed_dir)
-    elif config.learner:
-        config = fine_tuned(config, overrides)
     if group and config.trainer.name != "ppo":
         raise ValueError(f"distributed: expected trainer=ppo, got {config.trainer.name}, which trains in one process")
     is_first = group is None or group.first

@@ -42,10 +42,6 @@ def test_an_environment_without_arms_of_its_own_is_none():
         cli.expand_arguments(["learner=pair"], "view")
 
 
-def test_a_training_that_goes_on_with_an_arm_keeps_its_key():
-    assert cli.expand_arguments(["init=runs/a", "learner=ur5e"], "train") == ["init=runs/a", "learner=ur5e"]
-
-
 ENVIRONMENTS = {
     "preset": mimic.env_config("panda4dof"),
     "arms": EnvConfig(

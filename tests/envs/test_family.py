@@ -8,7 +8,7 @@ import pytest
 import mimic
 from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import panda_path
-from mimic.envs.family import SEEN, UNSEEN, arm_name, arm_sampler, report_arms
+from mimic.envs.family import SEEN, UNSEEN, arm_name, arm_sampler, report_arms, with_one_learner
 from mimic.envs.many_arms import AnyArmEnv
 from tests.helpers.untrained_run import family
 
@@ -35,6 +35,14 @@ def test_the_report_has_each_arm_once():
     assert list(arms[UNSEEN])[:5] == [f"locked {i}" for i in (2, 3, 4, 5, 6)]
     assert [int(arm.is_free.sum()) for arm in arms[SEEN].values()] == [7, 6, 6]
     assert list(arms[UNSEEN])[5:] == [f"random {i}" for i in range(16)]
+
+
+def test_an_environment_of_one_learner():
+    env = with_one_learner(family(), "panda", [2, 4])
+    assert env.kind == "one_arm" and env.physics == "auto" and env.learner.locked == [2, 4]
+    assert env.learner.armature == 0.1 and env.build_arms().learner.embodiment.num_joints == 5
+    with pytest.raises(ValueError, match="panda_pair: expected a serial arm, got a tree of 2 chains"):
+        with_one_learner(family(), "panda_pair", [])
 
 
 def test_arms_are_named_by_their_files(tmp_path):

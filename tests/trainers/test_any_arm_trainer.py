@@ -1,4 +1,4 @@
-"""Training of one policy for many arms: what the trainer says, and a run, its resumption and its fine-tuning."""
+"""Training of one policy for many arms: what the trainer says, a run, and its resumption."""
 
 import copy
 import dataclasses
@@ -8,12 +8,9 @@ import pytest
 
 import mimic
 from mimic.commands.fit import Run
-from mimic.envs.family import arms_config
-from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.ppo.trainer import EVALUATED_DEMONSTRATIONS
-from mimic.trainers.run_config import load_config
 from tests.helpers.commands import command
 from tests.helpers.untrained_run import ARMS, family
 
@@ -127,35 +124,3 @@ def test_it_can_be_resumed_evaluated_and_collected(finished, tmp_path):
     assert alone["optimality_gap"] == alone["controller_gap"] and alone["trainer"] == "nearest_pose"
     collected = command("collect", str(run_dir.parent), f"out={tmp_path}")
     assert collected.returncode == 0 and "panda_family" not in collected.stderr
-
-
-@pytest.mark.slow
-def test_it_goes_on_with_one_arm(finished, tmp_path):
-    run_dir, _ = finished
-    tuned = tmp_path / "tuned"
-    more = command("train", f"init={run_dir}", "learner=panda", "trainer.num_timesteps=80", f"run_dir={tuned}")
-    assert more.returncode == 0, more.stderr[-2000:]
-    report = json.loads((tuned / "report.json").read_text())
-    assert list(report["arms"]) == ["whole"] and report["optimality_gap"].keys() == {"train"}
-    config = load_config(tuned)
-    assert config.learner == "panda" and arms_config(config.env).most_locked == 0
-    resumed = command("train", f"resume={tuned}", "trainer.num_timesteps=160")
-    assert resumed.returncode == 0, resumed.stderr[-2000:]
-
-
-@pytest.mark.slow
-def test_fine_tuning_does_not_end_worse_than_it_began(finished, tmp_path):
-    """With a learning rate that destroys the policy, the result is the start, in the report and in what is kept."""
-    run_dir, _ = finished
-    tuned = tmp_path / "tuned"
-    learner = [f"init={run_dir}", "learner=panda", f"run_dir={tuned}"]
-    result = command("train", *learner, "trainer.num_timesteps=80", "trainer.learning_rate=0.9")
-    assert result.returncode == 0, result.stderr[-2000:]
-    assert "result: the parameters after 0 env steps; later ones were no better" in result.stdout
-    report = json.loads((tuned / "report.json").read_text())
-    assert report["env_steps"] == 0 and report["steps_per_second"] > 0 and checkpoint_steps(tuned) == [0]
-    whole = json.loads((run_dir / "report.json").read_text())["arms"]["whole"]
-    # 1e-3: another batch of rollouts, which round otherwise
-    assert report["arms"]["whole"]["mean_distance"] == pytest.approx(whole["mean_distance"], rel=1e-3)
-    resumed = command("train", f"resume={tuned}")
-    assert resumed.returncode == 2 and "has been trained for 0 of 80 steps" in resumed.stderr

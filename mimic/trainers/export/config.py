@@ -24,7 +24,7 @@ class ExportConfig:
       run: run directory.
       out: exported file, or folder of a controller; must not exist.
       format: "onnx", "jax", or "controller": a policy with an inner loop and what a robot needs beside it.
-      learner: of a run whose learner is any arm, an arm whose description is written to `out` instead.
+      learner: of a mapper to any arm, an arm whose description is written to `out` instead.
       locked: numbers or names of the joints of this arm that are locked.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
     """

@@ -1,6 +1,5 @@
 """`python -m mimic.export`: writes a trained policy or pose mapper to a file that runs without mimic."""
 
-import dataclasses
 import importlib
 import json
 import os
@@ -10,7 +9,6 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from rich.console import Console
 
 from mimic.arms.arm import ArmConfig
@@ -18,14 +16,12 @@ from mimic.arms.description import SUFFIX, save_description
 from mimic.base.config import check_choice, new_file, new_folder
 from mimic.base.distribution import install_command
 from mimic.base.files import write_atomically
-from mimic.envs.many_arms_control import torque_scale
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.export.config import CONTROLLER, EXPORT_FORMATS, ExportConfig
 from mimic.trainers.export.export_controller import prepare_controller
 from mimic.trainers.export.functions import ExportedFunction, make_function
 from mimic.trainers.export.onnx_model import to_onnx
-from mimic.trainers.fine_tuning import with_one_learner
 from mimic.trainers.pose_mapper.mapper_arm import describe_arm
 from mimic.trainers.run_config import load_config
 
@@ -47,25 +43,24 @@ def export_run(
     locked: Sequence[int | str] = (),
     checkpoint: int | None = None,
 ) -> Path:
-    """Writes the policy or the pose mapper of a run to a file that other programs can run without mimic.
+    """Writes the policy of one arm or the pose mapper of a run to a file that other programs can run without mimic.
 
     A policy maps `observation` [batch, observations] to `action` [batch, joints] in [-1, 1], without exploration, and
     to `torque` [N m]. A pose mapper maps `expert_qpos` [batch, joints] to `learner_qpos` [batch, learner_joints], both
     in rad. The file includes the normalisation of inputs and the scaling of outputs.
 
-    Of a run whose learner is any arm, the function has an input `learner`: the description of an arm, which this
-    function writes too. With the metadata's `learner_layout` it can also be made without mimic, see `ArmArrays` in
-    mimic/arms/arrays.py. Angles and torques are then [batch, 8], with those of locked joints, and 0 where the arm
-    has no joint; in the format "onnx" the batch size is 1. A policy of any arm is a step of its controller, with the
-    poses that it follows as an input and an output; the metadata says what the inputs are.
+    The function of a mapper to any arm has an input `learner`: the description of an arm, which this function writes
+    too. With the metadata's `learner_layout` it can also be made without mimic, see `ArmArrays` in
+    mimic/arms/arrays.py. Its angles are [batch, 8], with those of locked joints, and 0 where the arm has no joint; in
+    the format "onnx" the batch size is 1.
 
     Args:
       run: run directory.
       out: exported file; must not exist.
       format: "onnx", or "jax" for `jax.export.deserialize`, with the metadata in a second file named `out` + ".json";
         or "controller", a folder for `mimic.deploy`, see `export_controller`.
-      learner: of a run whose learner is any arm, an arm (see `ArmConfig.model`) whose description is written to `out`,
-        a .json file, instead of the network.
+      learner: of a mapper to any arm, an arm (see `ArmConfig.model`) whose description is written to `out`, a .json
+        file, instead of the network.
       locked: numbers or names of the joints of this arm that are locked.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
 
@@ -73,8 +68,8 @@ def export_run(
       Path of the file.
 
     Raises:
-      ValueError: the run or the checkpoint does not exist, the file cannot be written, the format is unknown, or a
-        package that it needs is not installed.
+      ValueError: the run or the checkpoint does not exist, it is a policy of many arms, the file cannot be written, the
+        format is unknown, or a package that it needs is not installed.
     """
     write, _ = _writer(ExportConfig(os.fspath(run), os.fspath(out), format, learner, list(locked), checkpoint))
     write()
@@ -108,7 +103,7 @@ def _writer(config: ExportConfig) -> tuple[Callable[[], None], str]:
         _check_no_learner(config)
         return lambda: write(out), ""
     if config.learner and config.run:
-        trained = load_config(_run_dir(config))
+        trained = _exportable(config)
         if trained.env.kind == "sampled_arms":
             check_checkpoint(_run_dir(config), config.checkpoint)
             return _description_writer(trained, config), ""
@@ -151,22 +146,32 @@ def _metadata_file(out: Path) -> Path:
     return out.with_name(out.name + ".json")
 
 
+def _exportable(config: ExportConfig) -> TrainConfig:
+    """The config of the run. Raises a `ValueError` for a policy with an inner loop, or of many arms."""
+    trained = load_config(_run_dir(config))
+    if trained.trainer.name == "ppo" and trained.env.kind == "inner_loop":
+        raise ValueError(f"format: expected {CONTROLLER} for a run with an inner loop, got {config.format}")
+    if trained.trainer.name == "ppo" and trained.env.kind == "sampled_arms":
+        raise ValueError(
+            f"run: expected a policy of one arm, or a pose mapper, got a policy of many arms, env={trained.env.name}; "
+            "train one for your arm with env=pair env.learner=ARM"
+        )
+    return trained
+
+
 def exported_function(config: ExportConfig) -> ExportedFunction:
     """The function of a run's network."""
-    run_dir = _run_dir(config)
-    trained = load_config(run_dir)
-    if trained.env.kind == "inner_loop" and trained.trainer.name == "ppo":
-        raise ValueError(f"format: expected {CONTROLLER} for a run with an inner loop, got {config.format}")
+    run_dir, trained = _run_dir(config), _exportable(config)
     steps = check_checkpoint(run_dir, config.checkpoint)
     _check_no_learner(config)
     return make_function(trained, run_dir, steps)
 
 
 def _description_writer(trained: TrainConfig, config: ExportConfig) -> Callable[[], None]:
-    """Writes the description of an arm for the exported function of a run whose learner is any arm.
+    """Writes the description of an arm for the exported function of a mapper to any arm.
 
     Raises:
-      ValueError: another suffix than that of descriptions, no such arm, or one that the run's function does not take.
+      ValueError: another suffix than that of descriptions, or no such arm.
     """
     file, learner, locked = new_file("out", config.out), config.learner, config.locked
     if file.suffix != SUFFIX:
@@ -174,20 +179,8 @@ def _description_writer(trained: TrainConfig, config: ExportConfig) -> Callable[
             f"out: expected a file {SUFFIX} for the description of learner={learner}, got {config.out!r}; "
             "export the network, which takes any arm, without learner="
         )
-    is_policy = trained.trainer.name == "ppo"
-    env, arm = trained.env, learner
-    if is_policy:
-        arm = with_one_learner(env, learner, locked).learner  # of up to 8 joints, locked ones included
-    elif locked:
-        arm = ArmConfig(model=learner, locked=list(locked))
-    described = describe_arm(env, arm)
-    arrays = described.data
-    if is_policy:  # the function would need many times as many operations with the inertia in the home pose
-        max_torque = torque_scale(jax.tree.map(jnp.asarray, arrays), env.action_scale, env.control_dt)
-        arrays = dataclasses.replace(arrays, torque_limit=np.asarray(max_torque))
-
-    name = described.embodiment.name
-    return lambda: save_description(file, arrays, name, described.slots, has_dynamics=is_policy)
+    described = describe_arm(trained.env, ArmConfig(model=learner, locked=list(locked)) if locked else learner)
+    return lambda: save_description(file, described.data, described.embodiment.name, described.slots)
 
 
 def _check_no_learner(config: ExportConfig) -> None:

@@ -44,7 +44,6 @@ from mimic.runs.checkpoints import (
 )
 from mimic.runs.divergence import check_finite
 from mimic.runs.signals import Signals
-from mimic.trainers.best_checkpoint import Best, Score, best_saved, better
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.networks import JointPolicy
 from mimic.trainers.schedules import schedules_from
@@ -647,7 +646,6 @@ def train(
     signals: Signals,
     restored: Checkpoint | None = None,
     on_compiling: Callable[[], None] = lambda: None,
-    score: Score | None = None,
 ) -> tuple[int, Params]:
     """Trains a policy. See `Trainer.train` for the result, the errors and the other arguments.
 
@@ -662,29 +660,22 @@ def train(
       restored: the checkpoint to continue from. With the training's state the result is that of a training that was not
         interrupted; without it, the optimizer and the environments start anew.
       on_compiling: called when the functions of the training start to compile; it may start work in other threads.
-      score: chooses the result: the checkpoint with the smallest value, unless `on_evaluation` ended the training.
-        None: the last checkpoint.
     """
-    best: Best | None = None
     pending: list[Checkpoint] = []
     stop = False
     for checkpoint in _checkpoints(env, config, seed, restored, on_compiling):
-        if score and restored and checkpoint.step == restored.step:
-            best = best_saved(run_dir, restored, score)  # here: its function compiles as that of the training does
         if checkpoint.step not in checkpoint_steps(run_dir):
             save_checkpoint(run_dir, *checkpoint)
-            thin_checkpoints(run_dir, config.keep, best and best.step)
+            thin_checkpoints(run_dir, config.keep)
         pending.append(checkpoint)
         if checkpoint.metrics:  # the start is evaluated with the first epoch: the evaluation compiles until then
             stop = [on_evaluation(each.step, each.params, each.metrics) for each in pending][-1]
-            if score:
-                best = better(best, pending, score)  # after the evaluation of the same parameters
             pending.clear()
         if checkpoint.step < config.total_steps:  # a finished training is not interrupted: there is nothing to resume
             signals.check()
         if stop:
             break
-    return (best.step, best.params) if best and not stop else (checkpoint.step, checkpoint.params)
+    return checkpoint.step, checkpoint.params
 
 
 def follow(env: ImitationEnv, config: PPOConfig, *, seed: int, restored: Checkpoint | None = None) -> None:

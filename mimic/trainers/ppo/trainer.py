@@ -26,15 +26,12 @@ from mimic.trainers.ppo import ppo, report_rows
 from mimic.trainers.trainer import Metrics, OnEvaluation, Params, Row, Trainer
 
 EVALUATED_DEMONSTRATIONS = 8  # of the held-out ones, by each of many arms: with 29 arms, 232 rollouts and bounds
-_VALIDATION = 64  # training demonstrations by which a fine-tuning chooses its result: one arm, so they cost little
 
 
 class PPOTrainer(Trainer):
     """Trains a policy on the training demonstrations, and evaluates it on these and on held-out ones.
 
-    A policy of many arms is evaluated on those of `report_arms`, on held-out demonstrations. The result of its
-    fine-tuning on one arm is the checkpoint with the smallest mean distance on training demonstrations, the start among
-    them, as training can make it worse.
+    A policy of many arms is evaluated on those of `report_arms`, on held-out demonstrations.
 
     Args:
       config: the run's config.
@@ -77,11 +74,8 @@ class PPOTrainer(Trainer):
         self.simulation = f"physics: {env.physics.name} ({env.physics.reason})"
         if self._is_cross_checked:
             self.simulation += "; the report evaluates the policy on MJX too"
-        self._validation: Demonstrations | None = None
         if self._has_many_arms:
             self._evaluate_many_arms(config, held_out.select(slice(0, EVALUATED_DEMONSTRATIONS)))
-            if config.learner and unseen is None:
-                self._validation = env.demonstrations.select(slice(0, _VALIDATION))
         else:
             self.evaluator = Evaluator(env, held_out)
         self._last: tuple[Params, Rollouts | None] = None, None  # parameters and their rollouts
@@ -128,12 +122,8 @@ class PPOTrainer(Trainer):
         return lambda observation: controller(SimpleNamespace(obs=observation))  # type: ignore[arg-type]
 
     def _compile(self) -> Callable[[Params], Rollouts]:
-        demonstrations = None
-        if self._validation is not None:  # in one function with the report's, which takes long to compile
-            demonstrations = concatenate(self._validation, self.evaluator.env.demonstrations)
-
         def rollouts(params: Params) -> Rollouts:
-            return self.evaluator.rollout(self.controller(params), demonstrations)
+            return self.evaluator.rollout(self.controller(params))
 
         return compiling(rollouts, self._params_shapes())()
 
@@ -179,7 +169,6 @@ class PPOTrainer(Trainer):
             signals=signals,
             restored=restored,
             on_compiling=self.prepare_evaluation,
-            score=None if self._validation is None else self._validation_distance,
         )
 
     def follow(self, restored: Checkpoint | None) -> None:
@@ -188,19 +177,6 @@ class PPOTrainer(Trainer):
 
     def evaluate(self, params: Params) -> Rollouts:
         """Runs the deterministic policy once on each demonstration, of many arms with each of them."""
-        return jax.tree.map(lambda x: x[self._validated :], self._run(params))
-
-    @property
-    def _validated(self) -> int:
-        """Number of rollouts on validation demonstrations, which are the first ones."""
-        return 0 if self._validation is None else self._validation.count
-
-    def _validation_distance(self, params: Params) -> float:
-        """The mean distance on validation demonstrations."""
-        return float(np.mean(self._run(params).distance[: self._validated], dtype=float))
-
-    def _run(self, params: Params) -> Rollouts:
-        """The rollouts on validation demonstrations, of which there may be none, and on those of the report."""
         last, rollouts = self._last
         if rollouts is None or last is not params:  # a checkpoint is evaluated, then compared
             # Parameters come from the host: each sharding over devices would need a compiled function of its own.
@@ -213,8 +189,7 @@ class PPOTrainer(Trainer):
         statistics, *networks = self._params_shapes()
         idle = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), statistics)
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), networks)
-        rollouts = jax.device_get(self._rollouts()((idle, *zeros)))
-        return jax.tree.map(lambda x: x[self._validated :], rollouts)
+        return jax.device_get(self._rollouts()((idle, *zeros)))
 
     @property
     def _is_cross_checked(self) -> bool:

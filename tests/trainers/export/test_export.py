@@ -220,6 +220,16 @@ def mapped(tmp_path_factory):
     return run_dir
 
 
+@pytest.fixture(scope="module")
+def any_mapper(tmp_path_factory):
+    """A run of a mapper to any arm, with a checkpoint that nothing reads."""
+    run_dir = tmp_path_factory.mktemp("mapper") / "any"
+    run_dir.mkdir()
+    save_config(run_dir, TrainConfig(mimic.env_config("any_arm"), PoseMapperConfig(preset="any_arm").resolve()))
+    save_checkpoint(run_dir, 5, {"weight": np.zeros(1, np.float32)})
+    return run_dir
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -235,6 +245,28 @@ def mapped(tmp_path_factory):
 )
 def test_bad_input_is_rejected(mapped, reason, arguments, message):
     assert message in reason("export", f"run={mapped}", *arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["out=new.onnx", "locked=[2]"], "locked: expected with learner=NAME, as in learner=panda locked=[2,4], got"),
+        (["out=new.onnx", "learner=panda"], "out: expected a file .json for the description of learner=panda"),
+        (["out=new.json", "learner=no_such_arm"], "model: expected panda, planar, panda_pair, an MJCF or URDF file"),
+        (["out=new.json", "learner=panda", "checkpoint=6"], "has no checkpoint 6; it has 5"),
+    ],
+)
+def test_an_arm_without_a_description_is_rejected(any_mapper, reason, arguments, message):
+    assert message in reason("export", f"run={any_mapper}", *arguments)
+
+
+@pytest.mark.parametrize("arguments", [["out=new.onnx"], ["out=new.json", "learner=panda"]])
+def test_a_policy_of_many_arms_is_rejected(reason, tmp_path, arguments):
+    (tmp_path / "run").mkdir()
+    save_config(tmp_path / "run", TrainConfig(mimic.env_config("panda_family"), PPOConfig(preset="any_arm").resolve()))
+    assert "run: expected a policy of one arm, or a pose mapper" in reason(
+        "export", f"run={tmp_path / 'run'}", *arguments
+    )
 
 
 def test_bad_input_is_one_line(mapped, rejected):
