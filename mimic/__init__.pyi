@@ -57,6 +57,8 @@ from .retargeting.kinematic_bound import closest_motion as closest_motion
 from .retargeting.kinematic_bound import kinematic_bound as kinematic_bound
 from .retargeting.pose import PoseImitation as PoseImitation
 from .retargeting.pose import imitate_pose as imitate_pose
+from .retargeting.teleoperation import FollowerCommand as FollowerCommand
+from .retargeting.teleoperation import Teleoperator as Teleoperator
 from .retargeting.trajectory import imitate_trajectory as imitate_trajectory
 from .trainers.export.export import export_run as export_run
 from .trainers.pose_mapper.mapper import AnyArmMapper as AnyArmMapper

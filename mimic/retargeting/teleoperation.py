@@ -1,0 +1,399 @@
+"""Live teleoperation: a leader arm drives a follower of another build, tick by tick.
+
+Each tick has three stages. A sample of the leader is checked, and gives a goal of the follower's hand. The posture
+takes steps to this goal within the velocity limits, see `mimic.retargeting.live_pose`; it never jumps to another
+branch. The command follows the posture by Ruckig's online trajectories, within all limits and always able to stop.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import continuous_joints
+from mimic.base.config import check_choice
+from mimic.base.distribution import install_command
+from mimic.control.limits import JointLimits, joint_limits
+from mimic.metric.config import MetricConfig
+from mimic.retargeting.hand_target import matched_hands, placement
+from mimic.retargeting.live_pose import FAR, ArmRows, Goal, LivePose
+from mimic.retargeting.pose import wrap_angles
+
+HANDS = ("exact", "relative")
+STATES = ("tracking", "nearest", "catching up", "approaching", "holding", "waiting", "disengaged")
+_TOLERANCE = 1e-3, np.radians(0.5)  # m, rad: hands that are nearer count as reached
+_STEPS = 2  # of the posture in a tick
+_MAX_SPEED = 4 * np.pi  # rad/s of a leader; a sample that moved faster is a jump
+_PATIENCE = 0.12  # s after which samples that agree with each other count, though they jumped or time ran backwards
+_TIMEOUT = 0.2  # s without a sample, after which the follower is said to hold
+_APPROACH = 0.5  # of the velocity limits, on the way to another posture
+_GRIPPER_TIME = 0.25  # s at least from closed to open
+_LANES, _ROUNDS = 12, 25  # postures of a search for another branch, and ticks that it takes
+_STUCK = 0.3  # s with a hand that is not reached, after which another branch is searched
+_LINE, _DETOUR = 16, 1.1  # points of a straight way to another branch; it may increase the hand's cost so much
+
+
+class TeleoperationStatus(NamedTuple):
+    """What the follower does.
+
+    Attributes:
+      state: one of `STATES`.
+      reason: of a state that is not "tracking", in words; also that a sample was ignored.
+      position_mm, rotation_deg: maximum error of the commanded hands; NaN while there is no goal.
+    """
+
+    state: str
+    reason: str
+    position_mm: float
+    rotation_deg: float
+
+
+class FollowerCommand(NamedTuple):
+    """A command of the follower.
+
+    Attributes:
+      qpos: [joints] angles at the end of the tick [rad].
+      gripper: in the units of the follower's range; None where the leader never gave one.
+      status: what the follower does.
+    """
+
+    qpos: Float[np.ndarray, " joints"]
+    gripper: float | None
+    status: TeleoperationStatus
+
+
+class Teleoperator:
+    """Drives a follower so that its hand does what the leader's does, with the posture nearest to the leader's.
+
+    Call `engage`, and `step` at each tick of the follower. Nothing compiles, and `step` raises no error for samples
+    that are not finite, late, lost or out of order: the follower then holds its goal and says why.
+
+    Args:
+      leader: the arm that gives the motion; without a known hand, as a person's, the end of its last link leads.
+      follower: the arm that is driven.
+      hand: "exact" puts the hand where the leader's is; "relative" repeats the leader's motion since `engage`, from
+        where the follower's hand was then (a clutch).
+      base: for the follower's base in the leader's base frame: see `imitate_pose`.
+      scale: factor on translations of the hand; about the leader's base with "exact".
+      mirror: reflect the motion between left and right, for a follower that faces the operator.
+      rate: ticks per second.
+      limits: of the follower. Default: position and velocity of its model, and what `joint_limits` derives from them.
+      velocity: [joints] or one number, maximum speed [rad/s], for a model that states none.
+      metric: of postures.
+      grippers: (closed, open) of the leader and of the follower, in the units of each.
+
+    Raises:
+      ValueError: an argument out of range, no velocity limit, a metric that is no weighted sum, or no ruckig.
+    """
+
+    def __init__(
+        self,
+        leader: Embodiment,
+        follower: Embodiment,
+        *,
+        hand: Literal["exact", "relative"] = "exact",
+        base: Any = None,
+        scale: float = 1.0,
+        mirror: bool = False,
+        rate: float = 100.0,
+        limits: JointLimits | None = None,
+        velocity: Any = None,
+        metric: MetricConfig | None = None,
+        grippers: tuple[Sequence[float], Sequence[float]] = ((0.0, 1.0), (0.0, 1.0)),
+    ):
+        check_choice("hand", hand, HANDS)
+        for name, number in (("scale", scale), ("rate", rate)):
+            if not (np.isfinite(number) and number > 0):
+                raise ValueError(f"{name}: expected a finite number above 0, got {number}")
+        self._period, self._scale, self._is_relative = 1.0 / rate, scale, hand == "relative"
+        self.limits = limits or follower_limits(follower, velocity)
+        self.leader, self.follower = leader, follower
+        self._rows = ArmRows(leader), ArmRows(follower)
+        self._pairs = matched_hands(leader, follower)
+        self._pose = LivePose(*self._rows, self._pairs, (metric or MetricConfig()).build(leader, follower))
+        where, mirrored = placement(base), np.array([1.0, -1.0 if mirror else 1.0, 1.0])
+        self._to_base, self._origin = where.rotation.T * mirrored, where.rotation.T @ where.position
+        self._mirrored = mirrored[:, None]
+        self._samples = _Samples(leader, self._period)
+        self._gripper = _Gripper(*grippers, self._period)
+        self._limiter = _Limiter(self.limits, self._period)
+        self._random = np.random.default_rng(0)
+        self._lower, self._upper = self.limits.position.T
+        self.reset(np.clip(follower.home, self._lower, self._upper))
+
+    def reset(self, qpos: Float[np.ndarray, " joints"]) -> None:
+        """Disengages, with the follower at rest at these angles [rad].
+
+        Raises:
+          ValueError: angles that are not finite or outside of the limits.
+        """
+        qpos = np.asarray(qpos, float)
+        joints = self.follower.num_joints
+        inside = qpos.shape == (joints,) and bool(np.all((qpos >= self._lower - 1e-6) & (qpos <= self._upper + 1e-6)))
+        if not inside:
+            raise ValueError(f"qpos: expected {joints} angles within the follower's limits [rad], got {qpos.tolist()}")
+        self._limiter.start(np.clip(qpos, self._lower, self._upper))
+        self.disengage()
+
+    def engage(self) -> None:
+        """Lets the next sample lead: with "relative" from here, with "exact" by an approach of limited speed."""
+        self.is_engaged, self._anchor, self._goal = True, None, None
+        self._posture = self._path = self._limiter.qpos
+        self._is_near, self._stuck, self._lanes, self._rounds = self._is_relative, 0.0, None, 0
+
+    def disengage(self) -> None:
+        """Brakes the follower, which then stays where it is."""
+        self.is_engaged, self._goal = False, None
+        self._samples.forget()
+
+    def step(self, leader_qpos: Any, gripper: float | None = None, time: float | None = None) -> FollowerCommand:
+        """The command of the next tick.
+
+        Args:
+          leader_qpos: [leader_joints] angles [rad]; None where no sample arrived.
+          gripper: of the leader, in the units of its range; None where unknown.
+          time: of the sample [s], on a clock of the leader; None to take each sample as new.
+
+        Raises:
+          ValueError: another number of joints, which is an error of the program.
+        """
+        sample = self._samples.accept(leader_qpos, time)
+        opening = self._gripper.step(gripper if self.is_engaged else None)
+        if not self.is_engaged:
+            status = TeleoperationStatus("disengaged", "engage() lets the leader drive", np.nan, np.nan)
+            return FollowerCommand(self._limiter.brake(), opening, status)
+        if sample is not None:
+            self._goal = self._goal_of(sample)
+        if self._goal is None:
+            status = TeleoperationStatus("waiting", self._samples.reason or "no sample yet", np.nan, np.nan)
+            return FollowerCommand(self._limiter.step(self._path), opening, status)
+        self._advance(self._goal)
+        qpos = self._limiter.step(self._path)
+        return FollowerCommand(qpos, opening, self._status(self._goal, qpos))
+
+    def _goal_of(self, sample: np.ndarray) -> Goal:
+        """The goal of a sample of the leader."""
+        leader, follower = self._rows
+        rows = leader(sample[None])
+        position, axes = (x[0, self._pairs[:, 0]] for x in leader.hand(rows))
+        position, axes = self._scale * leader.unit * position @ self._to_base.T, axes @ self._to_base.T
+        if not self._is_relative:
+            position, axes = position - self._origin, self._mirrored * axes
+        else:
+            if self._anchor is None:
+                start = (x[0, self._pairs[:, 1]] for x in follower.hand(follower(self._path[None])))
+                self._anchor = position, axes, *start
+            position_then, axes_then, start, start_axes = self._anchor
+            position = follower.unit * start + position - position_then
+            # Rows are axes: the rotation since then, R R_then^T, acts on each axis of the start.
+            axes = start_axes @ (np.swapaxes(axes_then, 1, 2) @ axes)
+        return self._pose.goal(rows, position / follower.unit, axes, self._to_base)
+
+    def _advance(self, goal: Goal) -> None:
+        """Moves the posture towards the goal, and the path towards the posture."""
+        reach = self.limits.velocity * self._period
+        lower, upper = np.maximum(self._lower, self._posture - reach), np.minimum(self._upper, self._posture + reach)
+        posture = self._posture[None]
+        for _ in range(_STEPS):
+            posture, _ = self._pose.step(goal, posture, lower, upper)
+        self._posture = posture[0]
+        self._search(goal)
+        away = self._posture - self._path
+        fraction = np.max(np.abs(away) / (reach * (1.0 if self._is_near else _APPROACH)))
+        self._is_near |= fraction <= 1
+        self._path = self._posture if fraction <= 1 else self._path + away / fraction
+
+    def _search(self, goal: Goal) -> None:
+        """Searches other branches at the start of an approach, and while the hand is not reached, a step in a tick."""
+        if self._lanes is None:
+            error = self._errors(goal, self._posture)
+            is_reached = error[0] <= _TOLERANCE[0] and error[1] <= _TOLERANCE[1]
+            self._stuck = 0.0 if is_reached or not self._is_near else self._stuck + self._period
+            if self._is_near and self._stuck < _STUCK:
+                return
+            if not self._is_near and self._rounds:
+                return  # on its way
+            low, high = np.maximum(self._lower, -np.pi), np.minimum(self._upper, np.pi)
+            self._lanes, self._rounds = self._random.uniform(low, high, (_LANES, len(low))), 0
+            self._lanes[0] = self._posture
+        box = np.maximum(self._lower, self._lanes - 0.5), np.minimum(self._upper, self._lanes + 0.5)
+        self._lanes, cost = self._pose.step(goal, self._lanes, *box, FAR)
+        self._rounds += 1
+        if self._rounds < _ROUNDS:
+            return
+        best, self._lanes, self._stuck = self._lanes[cost.argmin()], None, 0.0
+        if not self._is_near or self._leads_there(goal, best, float(cost.min())):
+            self._posture, self._is_near = best, False
+
+    def _leads_there(self, goal: Goal, posture: np.ndarray, cost: float) -> bool:
+        """Whether another branch is better, and the hand does not go away from its goal on the straight way there."""
+        line = self._posture + np.linspace(0, 1, _LINE)[:, None] * (posture - self._posture)
+        costs = self._pose.pulls(goal, self._rows[1](line))[2]
+        return cost < 0.5 * costs[0] and costs.max() <= _DETOUR * costs[0]
+
+    def _errors(self, goal: Goal, qpos: np.ndarray) -> tuple[float, float]:
+        """Maximum distance [m] and angle [rad] of the hands."""
+        position, axes = (x[0, self._pairs[:, 1]] for x in self._rows[1].hand(self._rows[1](qpos[None])))
+        apart = np.sqrt(((position - goal.position) ** 2).sum(axis=-1).max()) * self._rows[1].unit
+        cosine = (axes * goal.axes).sum(axis=-1)
+        chord = (3 - cosine.sum(axis=-1)) / 4 if self._pose.knows_roll else (1 - cosine[:, 2]) / 2
+        return float(apart), float(2 * np.arcsin(np.sqrt(np.clip(chord, 0, 1)).max()))
+
+    def _status(self, goal: Goal, qpos: np.ndarray) -> TeleoperationStatus:
+        """What the follower does, and why."""
+        position, rotation = self._errors(goal, qpos)
+        errors, reason = (1e3 * position, float(np.degrees(rotation))), self._samples.reason
+        if self._samples.age > _TIMEOUT:
+            return TeleoperationStatus("holding", reason or f"no sample for {self._samples.age:.1f} s", *errors)
+        if not self._is_near:
+            return TeleoperationStatus("approaching", "on the way to a posture with this hand", *errors)
+        if position <= _TOLERANCE[0] and rotation <= _TOLERANCE[1]:
+            return TeleoperationStatus("tracking", reason, *errors)
+        position, rotation = self._errors(goal, self._posture)
+        if position <= _TOLERANCE[0] and rotation <= _TOLERANCE[1]:
+            return TeleoperationStatus("catching up", reason or "the leader is faster than the limits", *errors)
+        at_limit = (self._posture - self._lower < 1e-3) | (self._upper - self._posture < 1e-3)
+        names = ", ".join(np.array(self.follower.joint_names)[at_limit])
+        why = f"{names} at the limit" if names else "out of reach" if position > _TOLERANCE[0] else "rotation not free"
+        why = f"{why}: the nearest hand is {1e3 * position:.0f} mm and {np.degrees(rotation):.0f} deg away"
+        return TeleoperationStatus("nearest", why, *errors)
+
+
+def follower_limits(follower: Embodiment, velocity: Any = None) -> JointLimits:
+    """The limits of an arm's model, with this velocity [rad/s] where it is given.
+
+    Raises:
+      ValueError: no finite velocity above 0.
+    """
+    speeds = np.asarray(follower.velocity_limit if velocity is None else velocity, float)
+    if speeds.shape not in ((), (follower.num_joints,)) or not np.all(np.isfinite(speeds) & (speeds > 0)):
+        raise ValueError(
+            f"velocity: expected {follower.num_joints} maximum speeds above 0 [rad/s], or one, got {speeds.tolist()}; "
+            f"inf is of a model that states none ({follower.name})"
+        )
+    speeds = np.broadcast_to(speeds, follower.num_joints)
+    return joint_limits(np.asarray(follower.joint_range, float), speeds, np.asarray(follower.torque_limit))
+
+
+class _Samples:
+    """Checks the leader's samples.
+
+    Attributes:
+      reason: why the last sample was ignored; empty where it was not.
+      age: time since the last sample that was accepted [s].
+    """
+
+    def __init__(self, leader: Embodiment, period: float):
+        self._joints, self._continuous, self._period = leader.num_joints, continuous_joints(leader), period
+        self.forget()
+
+    def forget(self) -> None:
+        """Takes the next sample wherever it is."""
+        self.reason, self.age, self._last, self._newest = "", 0.0, None, -np.inf
+        self._jumped, self._agreeing, self._backwards = None, 0.0, 0.0
+
+    def accept(self, qpos: Any, time: float | None) -> np.ndarray | None:
+        """The sample [joints]; None where there is none, or it is ignored."""
+        self.age += self._period
+        self.reason = ""
+        if qpos is None:
+            return None
+        sample = np.asarray(qpos, float)
+        if sample.shape != (self._joints,):
+            raise ValueError(f"leader_qpos: expected {self._joints} angles [rad], got shape {sample.shape}")
+        if not np.isfinite(sample).all() or (time is not None and not np.isfinite(time)):
+            self.reason = "ignored a sample that is not finite"
+        elif time is not None and self._is_old(time):
+            self.reason = "ignored a sample that is not newer than the last one"
+        elif self._is_jump(sample):
+            self.reason = "ignored a sample that jumped"
+        else:
+            self._last, self.age, self._jumped = sample, 0.0, None
+            return sample
+        return None
+
+    def _is_old(self, time: float) -> bool:
+        self._backwards = self._backwards + self._period if time <= self._newest else 0.0
+        if 0 < self._backwards <= _PATIENCE:
+            return True
+        self._newest, self._backwards = time, 0.0
+        return False
+
+    def _is_jump(self, sample: np.ndarray) -> bool:
+        reach = _MAX_SPEED * max(self.age, self._period)
+        if self._last is None or np.abs(wrap_angles(sample - self._last, self._continuous)).max() <= reach:
+            return False
+        before, self._jumped = self._jumped, sample
+        near = before is not None and np.abs(wrap_angles(sample - before, self._continuous)).max() <= reach
+        self._agreeing = self._agreeing + self._period if near else 0.0
+        return self._agreeing <= _PATIENCE
+
+
+class _Gripper:
+    """Maps the opening from the leader's range to the follower's, at a limited speed."""
+
+    def __init__(self, leader: Sequence[float], follower: Sequence[float], period: float):
+        for name, limits in (("leader", leader), ("follower", follower)):
+            if len(limits) != 2 or not np.isfinite(limits).all() or limits[0] == limits[1]:
+                raise ValueError(f"grippers: expected (closed, open) of the {name}, two finite numbers, got {limits}")
+        self._leader, self._follower, self._step = tuple(leader), tuple(follower), period / _GRIPPER_TIME
+        self._goal: float | None = None
+        self._fraction: float | None = None
+
+    def step(self, value: float | None) -> float | None:
+        """The follower's opening at the end of a tick; a value that is None or not finite changes no goal."""
+        closed, opened = self._leader
+        if value is not None and np.isfinite(value):
+            self._goal = float(np.clip((value - closed) / (opened - closed), 0, 1))
+        if self._goal is None:
+            return None
+        last = self._goal if self._fraction is None else self._fraction
+        self._fraction = last + float(np.clip(self._goal - last, -self._step, self._step))
+        return self._follower[0] + self._fraction * (self._follower[1] - self._follower[0])
+
+
+class _Limiter:
+    """Ruckig's online trajectories to rest at a goal, each joint for itself, or to rest as soon as possible."""
+
+    def __init__(self, limits: JointLimits, period: float):
+        try:
+            import ruckig
+        except ImportError as error:
+            raise ValueError(f"Teleoperator: needs the package ruckig: {install_command('deploy')}") from error
+        joints = len(limits.velocity)
+        self._ruckig, self._input = ruckig.Ruckig(joints, period), ruckig.InputParameter(joints)
+        self._output, self._interfaces = ruckig.OutputParameter(joints), ruckig.ControlInterface
+        # Joints that wait for each other may brake later than they can, and pass a position limit.
+        self._input.synchronization = ruckig.Synchronization.No
+        self._input.max_velocity, self._input.max_acceleration = limits.velocity.tolist(), limits.acceleration.tolist()
+        self._input.max_jerk = limits.jerk.tolist()
+        self._zero = [0.0] * joints
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """The last command [rad]."""
+        return np.array(self._input.current_position)
+
+    def start(self, qpos: np.ndarray) -> None:
+        """At rest at these angles [rad]."""
+        self._input.current_position = self._input.target_position = qpos.tolist()
+        self._input.current_velocity = self._input.current_acceleration = self._zero
+
+    def step(self, goal: np.ndarray) -> np.ndarray:
+        """Angles after a tick on the way to a goal [rad]."""
+        self._input.control_interface, self._input.target_position = self._interfaces.Position, goal.tolist()
+        return self._next()
+
+    def brake(self) -> np.ndarray:
+        """Angles after a tick of braking [rad]."""
+        self._input.control_interface = self._interfaces.Velocity
+        return self._next()
+
+    def _next(self) -> np.ndarray:
+        result = self._ruckig.update(self._input, self._output)
+        if result < 0:
+            raise RuntimeError(f"ruckig: {result}")
+        self._output.pass_to_input(self._input)
+        return self.qpos

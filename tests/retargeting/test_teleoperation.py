@@ -1,0 +1,201 @@
+"""A leader that drives a follower: within limits whatever arrives, without jumps, and at the leader's hand."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import mimic
+from mimic.retargeting.hand_target import matched_hands
+from mimic.retargeting.live_pose import FAR, ArmRows, LivePose
+from mimic.retargeting.teleoperation import follower_limits
+
+RATE = 100.0
+READY = np.array([0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4])
+SWAY = np.array([0.3, 0.2, 0.3, 0.2, 0.3, 0.2, 0.3])
+
+
+@pytest.fixture(scope="module")
+def arms():
+    leader = mimic.panda(limits="hardware")
+    # Other lengths, and without joint 3: six joints.
+    return leader, mimic.panda(limits="hardware", locked=[3])
+
+
+def sway(ticks, speed=1.0):
+    return READY + np.sin(speed * np.arange(ticks) / RATE)[:, None] * SWAY
+
+
+def drive(operator, samples, **arguments):
+    """The commands of samples, and the limits that they exceed."""
+    commands = [operator.step(sample, **arguments) for sample in samples]
+    return commands, np.array([command.qpos for command in commands])
+
+
+def excess(operator, path):
+    """Maximum of speed, acceleration and jerk over their limits, and of the angle beyond its range [rad]."""
+    limits, ratios = operator.limits, []
+    differences = path
+    for limit in (limits.velocity, limits.acceleration, limits.jerk):
+        differences = np.diff(differences, axis=0) * RATE
+        ratios.append(np.max(np.abs(differences) / limit))
+    lower, upper = limits.position.T
+    return max(ratios), np.max(np.maximum(lower - path, path - upper))
+
+
+def assert_within_limits(operator, path):
+    assert np.all(np.isfinite(path))
+    ratio, beyond = excess(operator, path)
+    assert ratio <= 1 + 1e-6 and beyond <= 1e-9  # differences of the limiter's rounding
+
+
+def test_rows_are_the_kinematics_and_their_derivatives(arms):
+    arm, step = arms[1], 1e-6
+    rows, qpos = ArmRows(arm), np.random.default_rng(0).uniform(-1, 1, (3, arm.num_joints))
+    frames, (position, axes) = mimic.hand_frames(arm, qpos), rows.hand(rows(qpos))
+    np.testing.assert_allclose(rows.unit * position, frames.position, atol=1e-6)  # of single precision
+    np.testing.assert_allclose(np.swapaxes(axes, 2, 3), frames.rotation, atol=1e-6)
+    states = mimic.link_states(arm, qpos)
+    np.testing.assert_allclose(rows(qpos).moving[:, : arm.num_links], states.position, atol=1e-6)
+    columns = rows.jacobian(rows(qpos))
+    for joint in range(arm.num_joints):
+        change = step * np.eye(arm.num_joints)[joint]
+        numeric = (rows(qpos + change).moving - rows(qpos - change).moving) / (2 * step)
+        np.testing.assert_allclose(np.swapaxes(columns[:, joint], 1, 2), numeric, atol=1e-8)
+
+
+def test_posture_is_that_of_imitate_pose(arms):
+    metric = mimic.metric.config.MetricConfig().build(*arms)
+    expected = mimic.imitate_pose(*arms, READY + SWAY, **metric.arguments, hand="exact")
+    rows = [ArmRows(arm) for arm in arms]
+    pose = LivePose(*rows, matched_hands(*arms), metric)
+    of_leader = rows[0](READY[None] + SWAY)
+    position, axes = rows[0].hand(of_leader)
+    goal = pose.goal(of_leader, position[0] * rows[0].unit / rows[1].unit, axes[0], np.eye(3))
+    lower, upper = arms[1].joint_range.T
+    qpos = np.random.default_rng(0).uniform(lower, upper, (24, 6))
+    for _ in range(40):
+        qpos, cost = pose.step(goal, qpos, np.maximum(lower, qpos - 0.5), np.minimum(upper, qpos + 0.5), FAR)
+    np.testing.assert_allclose(qpos[cost.argmin()], expected.qpos, atol=2e-3)
+
+
+@pytest.mark.parametrize("hand", ["exact", "relative"])
+def test_hand_is_reached(arms, hand):
+    operator = mimic.Teleoperator(*arms, hand=hand, rate=RATE)
+    operator.engage()
+    commands, path = drive(operator, [*sway(400, speed=0.5), *np.repeat(sway(400, speed=0.5)[-1:], 50, axis=0)])
+    status = commands[-1].status
+    assert status.state == "tracking" and status.position_mm < 0.1 and status.rotation_deg < 0.1
+    assert_within_limits(operator, path)
+
+
+def test_clutch_engages_anywhere_without_a_jump(arms):
+    operator = mimic.Teleoperator(*arms, hand="relative", scale=0.5, rate=RATE)
+    start = operator.step(None).qpos
+    operator.engage()
+    np.testing.assert_allclose(operator.step(READY + 0.8 * SWAY).qpos, start, atol=1e-4)
+    drive(operator, READY + 0.8 * SWAY + np.linspace(0, 1, 100)[:, None] * SWAY)
+    operator.disengage()
+    _, path = drive(operator, [READY] * 50)
+    assert_within_limits(operator, path)
+    operator.engage()
+    _, after = drive(operator, [READY - SWAY] * 20)
+    np.testing.assert_allclose(after, np.tile(path[-1], (20, 1)), atol=1e-3)
+
+
+def test_relative_hand_moves_by_the_scaled_motion(arms):
+    operator = mimic.Teleoperator(*arms, hand="relative", scale=0.5, base=[0, 0, 0, np.pi / 2], rate=RATE)
+    before = mimic.hand_frames(arms[1], operator.step(None).qpos).position[0]
+    operator.engage()
+    target = READY + np.array([0.0, 0.2, 0.0, 0.2, 0.0, 0.0, 0.0])
+    _, path = drive(operator, [*np.linspace(READY, target, 100), *[target] * 100])
+    ends = [mimic.hand_frames(arms[0], x).position[0] for x in (READY, target)]
+    moved = mimic.hand_frames(arms[1], path[-1]).position[0] - before
+    x, y, z = 0.5 * (ends[1] - ends[0])
+    np.testing.assert_allclose(moved, [y, -x, z], atol=2e-4)  # the base is rotated by 90 deg
+
+
+def test_mirror_reflects_the_hand(arms):
+    operator = mimic.Teleoperator(arms[0], arms[0], mirror=True, rate=RATE)
+    operator.engage()
+    pose = READY + np.array([0.4, 0.1, 0.2, 0.1, -0.2, 0.0, 0.3])
+    commands, path = drive(operator, [pose] * 600)
+    assert commands[-1].status.state == "tracking"
+    leader, follower = (jax.device_get(mimic.hand_frames(arms[0], x)) for x in (pose, path[-1]))
+    np.testing.assert_allclose(follower.position[0], leader.position[0] * [1, -1, 1], atol=1e-3)
+    approach = leader.rotation[0, :, 2] * np.array([1, -1, 1])
+    np.testing.assert_allclose(follower.rotation[0, :, 2], approach, atol=1e-2)
+
+
+BAD = {
+    "not finite": lambda n, s: np.where(n % 2, np.nan, s),
+    "jumped": lambda n, s: s + 2 * (n % 3 == 1),
+    "no sample": lambda n, s: None,
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_samples_hold_and_recover(arms, kind):
+    operator = mimic.Teleoperator(*arms, hand="relative", rate=RATE)
+    operator.engage()
+    good = sway(400)
+    samples = [*good[:100], *(BAD[kind](n, good[100 + n]) for n in range(100)), *good[200:]]
+    commands, path = drive(operator, samples)
+    assert_within_limits(operator, path)
+    reasons = " ".join(command.status.reason for command in commands[100:200])
+    assert kind in reasons and all(np.isfinite(command.status.position_mm) for command in commands)
+    assert all(command.status.state in ("tracking", "catching up") for command in commands[250:])
+
+
+def test_time_that_runs_backwards_is_ignored_then_accepted(arms):
+    operator = mimic.Teleoperator(*arms, hand="relative", rate=RATE)
+    operator.engage()
+    path, commands = sway(200), []
+    times = np.arange(200) / RATE - 50 * (np.arange(200) >= 100)  # the clock is set back
+    times[40] = times[30]
+    for sample, time in zip(path, times, strict=True):
+        commands.append(operator.step(sample, time=float(time)))
+    assert "newer" in commands[40].status.reason and "newer" not in commands[41].status.reason
+    assert "newer" in commands[100].status.reason and commands[130].status.state != "holding"
+    assert_within_limits(operator, np.array([command.qpos for command in commands]))
+
+
+def test_hand_out_of_reach_ends_at_the_nearest(arms):
+    operator = mimic.Teleoperator(*arms, base=[-1.0, 0, 0, 0], rate=RATE)  # the hand is 1.3 m away
+    operator.engage()
+    commands, path = drive(operator, [READY] * 800)
+    status = commands[-1].status
+    assert status.state == "nearest" and "mm" in status.reason and status.position_mm > 100
+    assert_within_limits(operator, path)
+    assert np.abs(np.diff(path[-50:], axis=0)).max() < 1e-4  # at rest
+    lower, upper = arms[1].joint_range.T
+    poses = np.random.default_rng(0).uniform(lower, upper, (20000, 6))
+    hands = np.asarray(mimic.hand_frames(arms[1], poses.astype(np.float32)).position)[:, 0]
+    goal = np.asarray(mimic.hand_frames(arms[0], READY).position)[0] + [1.0, 0, 0]
+    assert status.position_mm <= 1e3 * np.linalg.norm(hands - goal, axis=1).min() + 1
+
+
+def test_gripper_is_mapped_at_a_limited_speed(arms):
+    operator = mimic.Teleoperator(*arms, hand="relative", rate=RATE, grippers=((10, 60), (0.0, 0.08)))
+    operator.engage()
+    assert operator.step(READY).gripper is None
+    assert operator.step(READY, gripper=35).gripper == pytest.approx(0.04)
+    openings = [operator.step(READY, gripper=200 if n < 30 else np.nan).gripper for n in range(40)]
+    assert openings[-1] == pytest.approx(0.08)
+    assert np.max(np.diff(openings)) <= 0.08 / 25 + 1e-9
+
+
+def test_arguments_are_checked(arms):
+    bare = dataclasses.replace(arms[1], velocity_limit=np.full(6, np.inf))
+    with pytest.raises(ValueError, match=r"velocity: expected 6 maximum speeds.*states none"):
+        mimic.Teleoperator(arms[0], bare)
+    assert np.all(follower_limits(bare, 2.0).velocity == 2)
+    for arguments, match in (({"rate": 0}, "rate"), ({"scale": np.nan}, "scale"), ({"hand": "near"}, "hand")):
+        with pytest.raises(ValueError, match=match):
+            mimic.Teleoperator(*arms, **arguments)
+    operator = mimic.Teleoperator(*arms)
+    with pytest.raises(ValueError, match="expected 6 angles within the follower's limits"):
+        operator.reset([9.0] * 6)
+    with pytest.raises(ValueError, match=r"leader_qpos: expected 7 angles"):
+        operator.step([0.0] * 6)
