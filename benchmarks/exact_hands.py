@@ -239,7 +239,7 @@ def motion_rows(
     speeds, metric = np.array(SPEEDS[name]), MetricConfig().build(expert, learner)
     jump, arms = speeds * dt, (expert, learner)
     began = time.perf_counter()
-    base = mimic.find_base(*arms, [qpos], metric.correspondence, metric.weights, largest_jump=jump)
+    base = mimic.find_base(*arms, [qpos], **metric.arguments, largest_jump=jump)
     base_s = time.perf_counter() - began
     targets = np.linalg.inv(homogeneous(*placement(base))) @ hand_matrices(expert, qpos.astype(float))
 

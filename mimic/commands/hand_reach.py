@@ -94,7 +94,7 @@ def hand_reach(expert: ArmConfig, learner: ArmConfig, metric: MetricConfig, base
     built = metric.build(*pair)
     bases = np.zeros((1, 4)) if base is None or isinstance(base, str) else np.reshape(base, (1, 4))
     if isinstance(base, str):
-        found = best_bases(*pair, qpos[:_FRAMES], built.correspondence, built.weights)
+        found = best_bases(*pair, qpos[:_FRAMES], built)
         bases = np.concatenate([bases, np.round(found, 3)])
     reached = [_reach(pair, built, qpos, base) for base in bases]
     reach, postures = max(reached, key=lambda result: result[0].score)

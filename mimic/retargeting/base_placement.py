@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints
-from mimic.metric.distance import Correspondence, Weights
+from mimic.metric.distance import NO_HAND, Correspondence, HandWeights, Metric, Reduction, RotationMeasure, Weights
 from mimic.retargeting.hand_target import POSITION_TOLERANCE, Placement, placement
 from mimic.retargeting.pose import checked_poses, imitate_pose
 from mimic.retargeting.trajectory import imitate_trajectory
@@ -29,6 +29,9 @@ def find_base(
     correspondence: Correspondence,
     weights: Weights,
     *,
+    rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
+    hand_weights: HandWeights = NO_HAND,
     largest_jump: Float[ArrayLike, " learner_joints"] | float = 0.3,
     seed: int = 0,
 ) -> Float[np.ndarray, "4"]:
@@ -43,6 +46,7 @@ def find_base(
       motions: of the expert, [T, n] each [rad].
       correspondence: see `embodiment_distance`.
       weights: see `embodiment_distance`.
+      rotation, reduction, hand_weights: see `embodiment_distance`.
       largest_jump: see `imitate_trajectory`.
       seed: of the search.
 
@@ -57,10 +61,11 @@ def find_base(
     paths = [checked_poses(expert, np.asarray(motion, np.float32), "motions", axes=("time",)) for motion in motions]
     frames = np.concatenate(paths)
     frames = frames[np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int)]
-    bases = best_bases(expert, learner, frames, correspondence, weights, seed=seed)
+    metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
+    bases = best_bases(expert, learner, frames, metric, seed=seed)
     longest, best, options = max(paths, key=len), (-1.0, bases[0]), {"hand": "exact", "largest_jump": largest_jump}
     for base in bases:
-        motion = imitate_trajectory(expert, learner, longest, correspondence, weights, base=base, **options)
+        motion = imitate_trajectory(expert, learner, longest, base=base, **options, **metric.arguments)
         assert motion.hand is not None
         exact = float(motion.hand.exact.mean())
         if exact > best[0]:
@@ -74,8 +79,7 @@ def best_bases(
     expert: Embodiment,
     learner: Embodiment,
     frames: Float[np.ndarray, "frames joints"],
-    correspondence: Correspondence,
-    weights: Weights,
+    metric: Metric,
     *,
     seed: int = 0,
 ) -> Float[np.ndarray, "bases 4"]:
@@ -85,7 +89,7 @@ def best_bases(
     for _ in range(_ROUNDS):
         new = bases[np.arange(_BASES) % len(bases)] + generator.uniform(-spread, spread, (_BASES, 4))
         new[0] = bases[0]
-        of_new = _scores(expert, learner, frames, new, correspondence, weights)
+        of_new = _scores(expert, learner, frames, new, metric)
         bases, scores = np.concatenate([bases, new]), np.concatenate([scores, of_new])
         order = np.argsort(-scores, kind="stable")[:_BEST]
         bases, scores, spread = bases[order], scores[order], spread * _NARROWER
@@ -103,13 +107,12 @@ def _scores(
     learner: Embodiment,
     frames: Float[np.ndarray, "frames joints"],
     bases: Float[np.ndarray, "bases 4"],
-    correspondence: Correspondence,
-    weights: Weights,
+    metric: Metric,
 ) -> Float[np.ndarray, " bases"]:
     """Scores of bases: the mean over the frames of exact hands, room, and distance, or of positions."""
     poses, count = np.tile(frames, (len(bases), 1)), len(bases)
     stacked = repeated(bases, len(frames))
-    solution = jax.device_get(imitate_pose(expert, learner, poses, correspondence, weights, hand="exact", base=stacked))
+    solution = jax.device_get(imitate_pose(expert, learner, poses, hand="exact", base=stacked, **metric.arguments))
     lower, upper = np.asarray(learner.joint_range).T
     room = 2 * np.minimum(solution.qpos - lower, upper - solution.qpos) / (upper - lower)
     room = np.where(continuous_joints(learner), 1, room).min(axis=-1)

@@ -267,7 +267,7 @@ def test_a_base_is_found_from_which_a_small_arm_follows():
     small = dataclasses.replace(ARM, **{name: 0.6 * getattr(ARM, name) for name in lengths})
     swing = np.sin(np.linspace(0, 2, 60)[:, None] * np.array([0.7, 0.9, 0.5, 0.8, 1.1, 0.6, 1.3]))
     motion, metric = (np.asarray(ARM.home) + 0.2 * swing).astype(np.float32), MetricConfig().build(ARM, small)
-    base = find_base(ARM, small, [motion], metric.correspondence, metric.weights)
+    base = find_base(ARM, small, [motion], **metric.arguments)
     exact = [
         np.mean(imitate_trajectory(ARM, small, motion, **metric.arguments, hand="exact", base=b).hand.exact)
         for b in (None, base)
