@@ -45,6 +45,7 @@ MOTIONS = (
 )
 # rad/s, from the manufacturers' data sheets; MJCF files have none.
 SPEEDS: dict[str, list[float]] = {
+    "panda": [2.175] * 4 + [2.61] * 3,
     "ur5e": [3.14] * 6,
     "iiwa14": [1.48, 1.48, 1.74, 1.30, 2.26, 2.35, 2.35],
     "gen3": [1.39] * 4 + [1.22] * 3,

@@ -1,0 +1,231 @@
+"""Demonstrations of a Panda on other arms, with `python -m mimic.retarget`, and replayed in robosuite's tasks.
+
+    PYTHON benchmarks/robosuite_replay.py models FOLDER
+    python -m benchmarks.transfer FOLDER [--demonstrations DIR] [--arms ur5e ...] [--tasks lift ...] --work DIR
+    python -m benchmarks.transfer FOLDER ... --physics PYTHON      # beside it: task success
+
+PYTHON is one with robosuite. FOLDER/NAME/NAME.xml are its arms with the Panda's gripper. The base is from `base=auto`.
+
+The check is C MuJoCo's, of the written data set: hands are sites of both models, `exact` are frames within 1 mm and
+0.5 deg, `speed` is a fraction of the data sheets' limits, and `depth_mm` how deep links of the learner are in others;
+pairs of links that touch in every pose are left out. `gripper` says whether the gripper's values stay as they were.
+Round trip: of the Panda's lift to an arm, back, and again to the arm: errors of the Panda's hand, and of the joints of
+both. An arm with more than six joints has postures to choose from, which the metric does by the other arm's.
+
+In physics, `success` is robosuite's at the end. Beside mimic: seeded `ssik`, and `copied` joints, from the same base.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import mujoco
+import numpy as np
+
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import Row, print_table, write_results
+from benchmarks.exact_hands import SPEEDS, as_numbers, followed_by_ssik, homogeneous
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.compile_check import VELOCITY_LIMIT
+from mimic.commands.config import RetargetConfig
+from mimic.commands.retarget import prepare_retargeting
+from mimic.envs.config import EnvConfig
+from mimic.retargeting.hand_target import placement
+
+ARMS = "ur5e", "iiwa14", "gen3", "jaco", "xarm7"
+TASKS = "lift", "stack", "nut-assembly", "pick-place", "door"
+PAIRS = "learner task frames exact mm:.3f deg:.3f speed:.2f margin_deg:.1f depth_mm:.1f gripper ok seconds:.0f"
+PHYSICS = "learner task method success objects tracking_error_rad:.3f"
+_SITE, _EPISODE = "gripper0_right_grip_site", "data/demo_1"
+_POSES = 100  # random ones, in which links that always touch are found
+
+
+class Model:
+    """An arm in C MuJoCo."""
+
+    def __init__(self, path: Path):
+        self.model = mujoco.MjModel.from_xml_path(str(path))
+        self.data = mujoco.MjData(self.model)
+        hinges = np.flatnonzero(self.model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE))
+        self.address, self.range = self.model.jnt_qposadr[hinges], self.model.jnt_range[hinges]
+        self.range[~self.model.jnt_limited[hinges].astype(bool)] = [-np.inf, np.inf]
+        lower, upper = np.clip(self.range, -np.pi, np.pi).T
+        poses = np.random.default_rng(0).uniform(lower, upper, (_POSES, len(hinges)))
+        self.always = set.intersection(*(set(self.depths(qpos)) for qpos in poses))
+
+    def set(self, qpos: np.ndarray) -> None:
+        self.data.qpos[self.address] = qpos
+        mujoco.mj_fwdPosition(self.model, self.data)
+
+    def hand(self, qpos: np.ndarray) -> np.ndarray:
+        """Pose [4, 4] of the hand in the base frame."""
+        self.set(qpos)
+        site = self.data.site(_SITE)
+        return homogeneous(site.xmat.reshape(3, 3), site.xpos)
+
+    def depths(self, qpos: np.ndarray) -> dict[tuple[int, int], float]:
+        """How deep bodies are in others [m], by their numbers."""
+        self.set(qpos)
+        bodies = self.model.geom_bodyid
+        contacts = [self.data.contact[i] for i in range(self.data.ncon)]
+        return {(int(bodies[c.geom1]), int(bodies[c.geom2])): -float(c.dist) for c in contacts}
+
+
+def with_speeds(folder: str, name: str) -> Path:
+    """The file of an arm, which states the velocity limits of its data sheet."""
+    path = Path(folder) / name / f"{name}_with_speeds.xml"
+    root = ET.parse(path.with_name(f"{name}.xml")).getroot()
+    custom = root.find("custom")
+    custom = ET.SubElement(root, "custom") if custom is None else custom
+    ET.SubElement(custom, "numeric", name=VELOCITY_LIMIT, data=" ".join(map(str, SPEEDS[name])))
+    path.write_text(ET.tostring(root, encoding="unicode"))
+    return path
+
+
+def retarget(source: Path, expert: Path, learner: Path, out: Path, base: Any) -> dict[str, Any]:
+    """The report of the command, and its seconds."""
+    env = EnvConfig(expert=ArmConfig(model=str(expert)), learner=ArmConfig(model=str(learner)))
+    began = time.perf_counter()
+    work = prepare_retargeting(RetargetConfig(source=str(source), env=env, out=str(out), base=base, failing="kept"))
+    assert work() == 0
+    return {**json.loads((out / "report.json").read_text()), "seconds": time.perf_counter() - began}
+
+
+def learner_motion(out: Path) -> dict[str, np.ndarray]:
+    """Angles and the gripper's values of a data set that was written."""
+    with h5py.File(out / "demo.hdf5") as file:
+        entries = {"qpos": "obs/robot0_joint_pos", "gripper": "obs/robot0_gripper_qpos", "actions": "actions"}
+        return {key: np.asarray(file[f"{_EPISODE}/{entry}"], float) for key, entry in entries.items()}
+
+
+def targets(expert: Model, qpos: np.ndarray, base: list[float]) -> np.ndarray:
+    """Hands [time, 4, 4] of the expert in the learner's base frame."""
+    return np.linalg.inv(homogeneous(*placement(base))) @ np.stack([expert.hand(pose) for pose in qpos])
+
+
+def check(learner: Model, qpos: np.ndarray, hands: np.ndarray, dt: float, speeds: list[float]) -> Row:
+    """What C MuJoCo says of a motion."""
+    own = np.stack([learner.hand(pose) for pose in qpos])
+    position = np.linalg.norm(own[:, :3, 3] - hands[:, :3, 3], axis=1)
+    chord = np.linalg.norm(own[:, :3, :3] - hands[:, :3, :3], axis=(1, 2)) / np.sqrt(8)
+    rotation = 2 * np.arcsin(np.minimum(chord, 1))
+    depths = [max((d for p, d in learner.depths(q).items() if p not in learner.always), default=0.0) for q in qpos]
+    margin = np.minimum(qpos - learner.range[:, 0], learner.range[:, 1] - qpos).min()
+    return {
+        "exact": int(np.sum((position <= 1e-3) & (rotation <= np.radians(0.5)))),
+        "mm": 1e3 * position.max(),
+        "deg": np.degrees(rotation.max()),
+        "speed": (np.abs(np.diff(qpos, axis=0)) / dt / speeds).max(),
+        "margin_deg": np.degrees(margin),
+        "depth_mm": 1e3 * max(depths),
+    }
+
+
+def pair_row(options: argparse.Namespace, expert: Model, name: str, learner: Model, task: str) -> Row:
+    """A demonstration on an arm, checked."""
+    folder = Path(options.folder)
+    source, out = Path(options.demonstrations) / task / "demo.hdf5", Path(options.work) / f"{task}_{name}"
+    with h5py.File(source) as file:
+        states, actions = (np.asarray(file[f"{_EPISODE}/{key}"], float) for key in ("states", "actions"))
+    report = retarget(source, folder / "panda/panda.xml", with_speeds(options.folder, name), out, "auto")
+    (episode,), motion, dt = report["episodes"], learner_motion(out), float(np.median(np.diff(states[:, 0])))
+    np.save(out.with_suffix(".npy"), motion["qpos"])
+    hands = targets(expert, states[:, 1:8], report["base"])
+    same = np.array_equal(motion["gripper"], states[:, 8:10]) and np.array_equal(motion["actions"], actions)
+    checked = check(learner, motion["qpos"], hands, dt, SPEEDS[name])
+    causes = [f"{x['cause']}, frames {x['first']} to {x['last']}" for x in episode["failures"]]
+    row = {"learner": name, "task": task, "frames": len(states), **checked, "gripper": same, "ok": episode["ok"]}
+    return as_numbers({**row, "seconds": report["seconds"], "base": report["base"], "failures": causes})
+
+
+def round_trip(options: argparse.Namespace, expert: Model, name: str) -> Row:
+    """The Panda's lift on an arm, back on the Panda, and again on the arm."""
+    work, panda, arm = Path(options.work), Path(options.folder) / "panda/panda.xml", with_speeds(options.folder, name)
+    there, back, again = (work / f"lift_{name}{end}" for end in ("", "_panda", f"_panda_{name}"))
+    base = json.loads((there / "report.json").read_text())["base"]
+    x, y, z, yaw = base
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    inverse = [float(number) for number in (-cosine * x - sine * y, sine * x - cosine * y, -z, -yaw)]
+    retarget(there / "demo.hdf5", arm, panda, back, inverse)
+    retarget(back / "demo.hdf5", panda, arm, again, base)
+    with h5py.File(Path(options.demonstrations) / "lift/demo.hdf5") as file:
+        recorded = np.asarray(file[f"{_EPISODE}/states"], float)[:, 1:8]
+    first, returned, last = (learner_motion(folder)["qpos"] for folder in (there, back, again))
+    row = check(expert, returned, targets(expert, recorded, [0.0] * 4), 0.05, SPEEDS["panda"])
+    rad = {"expert_rad": np.abs(returned - recorded).max(), "learner_rad": np.abs(last - first).max()}
+    return as_numbers({"learner": name, "mm": row["mm"], "deg": row["deg"], **rad})
+
+
+def other_methods(options: argparse.Namespace, expert: Model, row: Row) -> Iterator[tuple[str, np.ndarray]]:
+    """Joint angles of the Panda copied, and those of seeded inverse kinematics; the same base."""
+    path = Path(options.demonstrations) / row["task"] / "demo.hdf5"
+    with h5py.File(path) as file:
+        qpos = np.asarray(file[f"{_EPISODE}/states"], float)[:, 1:8]
+    arm = build_arm(ArmConfig(model=str(with_speeds(options.folder, row["learner"]))), "hardware").embodiment
+    lower, upper = arm.joint_range.T
+    yield "copied", np.clip(qpos[:, : arm.num_joints], lower, upper)
+    yield "ssik", followed_by_ssik(arm, targets(expert, qpos, row["base"]), np.asarray(arm.home, float))
+
+
+def in_physics(options: argparse.Namespace, expert: Model, rows: list[Row]) -> list[Row]:
+    """Task success of each pair and method, and of the Panda's own motions."""
+    work, jobs = Path(options.work).absolute(), []
+
+    def add(task: str, name: str, method: str, base: list[float], qpos: np.ndarray) -> None:
+        path, folder = work / f"{task}_{name}_{method}.npy", Path(options.demonstrations).absolute() / task
+        np.save(path, qpos)
+        frames = np.linspace(0, len(qpos) - 1, 4).round().astype(int).tolist()
+        job = {"task": task, "robot": name, "method": method, "base": base, "motion": str(path), "frames": frames}
+        jobs.append({**job, "demonstration": str(folder)})
+
+    for task in options.tasks:
+        with h5py.File(Path(options.demonstrations) / task / "demo.hdf5") as file:
+            add(task, "panda", "recorded", [0.0] * 4, np.asarray(file[f"{_EPISODE}/states"], float)[:, 1:8])
+    for row in rows:
+        add(row["task"], row["learner"], "mimic", row["base"], np.load(work / f"{row['task']}_{row['learner']}.npy"))
+        for method, qpos in other_methods(options, expert, row):
+            add(row["task"], row["learner"], method, row["base"], qpos)
+    (work / "jobs.json").write_text(json.dumps(jobs))
+    script = Path(__file__).with_name("robosuite_replay.py")
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    command = [options.physics, str(script), "replay", str(work / "jobs.json"), str(work / "replays.json")]
+    subprocess.run(command, check=True, env=environment)
+    keys = "task", "method", "success", "ever", "objects", "tracking_error_rad"
+    results = json.loads((work / "replays.json").read_text())
+    return [{"learner": result["robot"], **{key: result[key] for key in keys}} for result in results]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = make_parser(
+        "transfer", __doc__, demonstrations="../shared/data/robosuite_demos", work="transfer", arms=ARMS, tasks=TASKS,
+        physics="",
+    )  # fmt: skip
+    parser.add_argument("folder")
+    options = parser.parse_args(arguments)
+    Path(options.work).mkdir(parents=True, exist_ok=True)
+    expert, content = Model(Path(options.folder) / "panda/panda.xml"), {"pairs": [], "round_trip": [], "physics": []}  # type: ignore[var-annotated]
+    for name in options.arms:
+        learner = Model(Path(options.folder) / name / f"{name}.xml")
+        for task in options.tasks:
+            content["pairs"].append(pair_row(options, expert, name, learner, task))
+            write_results(options, **content)
+            print_table(content["pairs"][-1:], PAIRS)
+        if "lift" in options.tasks:
+            content["round_trip"].append(round_trip(options, expert, name))
+    if options.physics:
+        content["physics"] = in_physics(options, expert, content["pairs"])
+    write_results(options, **content)
+    print_table(content["pairs"], PAIRS, "pairs")
+    print_table(content["round_trip"], "learner mm:.4f deg:.4f expert_rad:.4f learner_rad:.4f", "round trip of lift")
+    print_table(content["physics"], PHYSICS, "physics")
+
+
+if __name__ == "__main__":
+    main()
