@@ -48,11 +48,6 @@ def velocity(joint, value):
     return np.where(np.arange(7) == joint, value, 0.0)
 
 
-def clear_in(rows, function):
-    """A clearance that depends on the first joint alone."""
-    return function(rows[:, 0])
-
-
 def test_an_accepted_target_moves_the_arm(layer):
     qpos, qvel, _ = run(layer, velocity(0, 0.5), ticks=20).transpose(1, 0, 2)
     assert qvel[-1, 0] == pytest.approx(0.5 * bundles.parameters().velocity[0], rel=1e-3)

@@ -26,18 +26,16 @@ SPLITS = {"train": slice(0, COUNT), "held_out": slice(COUNT, None)}
 LINKS = {"link_lengths": [0.6, 0.4]}
 
 
+def make_evaluator(name="planar4dof", count=COUNT, held_out=HELD_OUT, **settings):
+    config = mimic.env_config(name, demonstrations={"count": count, "held_out": held_out}, **settings)
+    training, others = training_and_held_out(config)
+    return Evaluator(mimic.ImitationEnv(config, training), others)
+
+
 @pytest.fixture(scope="module")
 def evaluator():
     """For an arm that imitates an equal arm."""
-    config = mimic.env_config(
-        "planar4dof",
-        expert=LINKS,
-        learner=LINKS,
-        demonstrations={"count": COUNT, "held_out": HELD_OUT},
-        horizon=HORIZON,
-    )
-    training, held_out = training_and_held_out(config)
-    return Evaluator(mimic.ImitationEnv(config, training), held_out)
+    return make_evaluator(expert=LINKS, learner=LINKS, horizon=HORIZON)
 
 
 def rollouts(evaluator, turned=(0.0, 0.0), faster=(0.0, 0.0), distance=None):
@@ -289,9 +287,7 @@ def test_actions_out_of_range_get_the_maximum_torque(evaluator):
 
 def test_the_bound_of_an_equal_arm_needs_no_search(monkeypatch):
     monkeypatch.setattr(references, "closest_motion", None)  # would fail
-    config = mimic.env_config("panda7dof", demonstrations={"count": 2, "held_out": 1})
-    training, held_out = training_and_held_out(config)
-    evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
+    evaluator = make_evaluator("panda7dof", 2, 1)
     assert evaluator.lower_bound.shape == evaluator.hold_distance.shape == (3, 50)
     assert not evaluator.lower_bound.any() and evaluator.hold_distance[:, -1].min() > 0.01
 
@@ -299,9 +295,7 @@ def test_the_bound_of_an_equal_arm_needs_no_search(monkeypatch):
 @pytest.mark.slow
 def test_no_rollout_goes_below_the_bound():
     """Random controllers on the planar arm. 1e-4: the tolerance of the search."""
-    config = mimic.env_config("planar4dof", **SHORT_ARMS, demonstrations={"count": 3, "held_out": 2}, horizon=HORIZON)
-    training, held_out = training_and_held_out(config)
-    evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
+    evaluator = make_evaluator(count=3, held_out=2, **SHORT_ARMS, horizon=HORIZON)
     rollout = jax.jit(lambda gain: evaluator.rollout(lambda state: gain @ state.obs))
     size = evaluator.env.action_size, evaluator.env.observation_size
     for seed in range(5):
@@ -320,10 +314,7 @@ def test_bound_and_hold_distance_belong_to_the_samples_after_each_step():
     """Closed forms for the directions of planar arms. 1e-4: the tolerance of the search."""
     metric = {"correspondence": "overlap", "translation": 0.0, "linear_velocity": 0.0, "angular_velocity": 0.0}
     metric |= {"hand_rotation": 0.0}
-    few = {"count": 1, "held_out": 1}
-    config = mimic.env_config("planar4dof", **SHORT_ARMS, demonstrations=few, horizon=12, metric=metric)
-    training, held_out = training_and_held_out(config)
-    evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
+    evaluator = make_evaluator(count=1, held_out=1, **SHORT_ARMS, horizon=12, metric=metric)
     env = evaluator.env
     optimum = planar_optimum(env.expert, env.learner, env.demonstrations.qpos)
     np.testing.assert_allclose(evaluator.lower_bound, optimum[:, 1:], atol=1e-4)

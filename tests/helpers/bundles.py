@@ -78,13 +78,6 @@ def constant(*numbers: float) -> Any:
     return lambda values: jnp.asarray(numbers, jnp.float32)
 
 
-def of_all(values: dict[str, Any]) -> Any:
-    """An action that depends on all that a policy observes; of its past ones, on the one before the last."""
-    vectors = (values[name] for name in ("qpos", "qvel", "reference_qpos", "reference_qvel"))
-    own = sum((i + 1) * vector for i, vector in enumerate(vectors))
-    return 0.01 * own + 0.1 * values["past_actions"][7:14] + 0.01 * values["features"].sum()
-
-
 def make_bundle(
     folder: Path,
     action: Any = sine,

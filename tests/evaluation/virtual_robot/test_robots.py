@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ import pytest
 from mimic.control.joint_control import PERIOD
 from mimic.evaluation.virtual_robot import robots as reflexes
 from mimic.evaluation.virtual_robot.draws import edge_cases
-from mimic.physics.step import Load, make_advance
 from mimic.physics.world import WorldConfig
 from tests.helpers.bundles import FOLDED, ON_FLOOR, panda
 from tests.helpers.virtual_robots import hardware, home, model, virtual, world
@@ -42,20 +40,6 @@ def test_without_a_world_it_is_mujoco():
         robots.step(torque[None])
     assert np.abs(robots.qvel).max() > 0.1
     np.testing.assert_array_equal(robots.qpos[0], data.qpos)
-
-
-def test_without_a_world_it_is_the_fused_physics():
-    """RK4 of the environment against Euler at 1 ms: 1e-3 rad/s^2 of error in a second is 0.5 mrad."""
-    robots = virtual()
-    torque = np.array([3.0, -5, 2, 3, 0.5, 0.4, 0.3])
-    for _ in range(400):
-        robots.step(torque[None] * min(robots.periods / 100, 1))
-    advance = make_advance(panda().model, PERIOD, 1, "fused")
-    qpos, qvel = jnp.asarray(home(), jnp.float32), jnp.zeros(7)
-    for period in range(400):
-        qpos, qvel = advance(qpos, qvel, jnp.asarray(torque * min(period / 100, 1), jnp.float32), Load(1.0, 1.0))
-    assert np.abs(robots.qpos - home()).max() > 0.05
-    np.testing.assert_allclose(robots.qpos[0], qpos, atol=1e-3)
 
 
 def test_gravity_is_compensated_but_for_its_error():
