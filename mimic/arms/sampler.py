@@ -80,11 +80,6 @@ def mixed_sampler(samplers: Sequence[Sampler], probabilities: Sequence[float]) -
     return draw
 
 
-def limited_sampler(sampler: Sampler, count: int) -> Sampler:
-    """The first `count` arms of a sampler, each as often as the others."""
-    return lambda key: sampler(jax.random.fold_in(jax.random.PRNGKey(0), jax.random.randint(key, (), 0, count)))
-
-
 def perturbed_sampler(arms: Sequence[ArmArrays]) -> Sampler:
     """One of several arms, with another size, other masses and drives, and some times with a joint locked at home.
 

@@ -98,9 +98,6 @@ class ArmsConfig:
       perturbed_fraction: of `models`, each drawn with another size, other masses, rotors, damping and velocity limits.
       models: arms to draw perturbed ones from: names or files, see `ArmConfig.model`.
       random_fraction: of random arms, see `random_arm` in mimic/arms/sampler.py.
-      reward: "relative": how much nearer the arm is than with the controller that the zero action is; or "distance",
-        without it. See `AnyArmEnv`.
-      distinct: number of distinct arms in a training; 0 draws a new arm for each episode.
       evaluated: arms that the report shows too, as names or files. They should not be in `models`.
       armature, damping: minimum of each joint of `models` and `evaluated`, see `ArmConfig`; the default is the Panda's.
     """
@@ -112,15 +109,12 @@ class ArmsConfig:
     perturbed_fraction: float = number(0.0, at_least=0.0, at_most=1e6)
     models: list[str] = dataclasses.field(default_factory=list)
     random_fraction: float = number(0.0, at_least=0.0, at_most=1e6)
-    reward: str = "relative"
-    distinct: int = number(0, at_least=0, at_most=2**31 - 1)
     evaluated: list[str] = dataclasses.field(default_factory=list)
     armature: float = number(0.1, at_least=0.0, at_most=1e4)
     damping: float = number(1.0, at_least=0.0, at_most=1e4)
 
     def __post_init__(self) -> None:
         check_ranges(self, "arms.")
-        check_choice("arms.reward", self.reward, ("relative", "distance"))
         check_choice("arms.expert", self.expert, ("fixed", "drawn"))
         if not self.locked_fraction + self.perturbed_fraction + self.random_fraction > 0:
             raise ValueError(

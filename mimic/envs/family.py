@@ -11,7 +11,6 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, lock_joints, masked_arrays
 from mimic.arms.sampler import (
     Sampler,
-    limited_sampler,
     lock_masks,
     lock_sampler,
     mixed_sampler,
@@ -58,8 +57,7 @@ def arm_sampler(config: EnvConfig) -> Sampler:
         parts.append((arms.random_fraction, random_arm))
     total = sum(weight for weight, _ in parts)
     samplers = [sampler for _, sampler in parts]
-    sampler = samplers[0] if len(parts) == 1 else mixed_sampler(samplers, [weight / total for weight, _ in parts])
-    return limited_sampler(sampler, arms.distinct) if arms.distinct else sampler
+    return samplers[0] if len(parts) == 1 else mixed_sampler(samplers, [weight / total for weight, _ in parts])
 
 
 def check_family(config: EnvConfig) -> None:

@@ -23,7 +23,7 @@ from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.arms.sampler import Sampler
 from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig
-from mimic.envs.family import arm_sampler, arms_config, check_family
+from mimic.envs.family import arm_sampler, check_family
 from mimic.envs.imitation import ImitationEnv, where_done
 from mimic.envs.many_arms_control import Plan, make_plan, max_speed, planned_torque, torque_scale
 from mimic.envs.many_arms_observation import observation_size, observe
@@ -53,7 +53,7 @@ class AnyArmState(ArmState):
       followed: the local minima at the last step, after the choice of the goal.
       goals: the local minima that the controller follows, which `with_plan` derives from `followed`.
       plan: what the controller does in the next step; from `with_plan`.
-      baseline: the same episode with zero actions, which a relative reward compares with; otherwise None.
+      baseline: the same episode with zero actions, which the reward compares with; None in `AnyArmEnv.by_distance`.
     """
 
     arm: ArmArrays = None  # type: ignore[assignment] - fields after one with a default need one too
@@ -68,11 +68,10 @@ class AnyArmState(ArmState):
 class AnyArmEnv(ImitationEnv):
     """An `ImitationEnv` whose learner is drawn by a sampler for each episode, and carried by the state.
 
-    Reward, as `config.arms.reward` says. "distance": minus the embodiment distance to the expert after the step,
-    divided by the mean distance of holding the home pose. "relative": how much nearer the arm is than with zero actions
-    since the start of the episode, see `relative_reward`; then the controller, which is simulated too, has the return 0
-    on every arm, and all arms count alike. Action: for each joint slot a change of its acceleration in [-1, 1], see
-    `planned_torque`. Observation: see `mimic.envs.many_arms_observation.observe`.
+    Reward: how much nearer the arm is than with zero actions since the start of the episode, see `relative_reward`: the
+    controller, which is simulated too, has the return 0 on every arm, and all arms count alike. Action: for each joint
+    slot a change of its acceleration in [-1, 1], see `planned_torque`. Observation: see
+    `mimic.envs.many_arms_observation.observe`.
 
     Args:
       config: see `EnvConfig`; of the kind "sampled_arms".
@@ -90,6 +89,7 @@ class AnyArmEnv(ImitationEnv):
 
     def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None, sampler: Sampler | None = None):
         check_family(config)
+        self._has_baseline = True
         self.sampler = sampler or arm_sampler(config)
         super().__init__(config, demonstrations)
 
@@ -114,10 +114,12 @@ class AnyArmEnv(ImitationEnv):
         self.expert_states = jax.jit(jax.vmap(jax.vmap(states)))(*motions)
 
     def by_distance(self) -> "AnyArmEnv":
-        """The same environment with the reward "distance", whose state has no baseline to simulate."""
+        """The same environment without a baseline to simulate.
+
+        The reward is then minus the embodiment distance after the step, in units of holding the home pose.
+        """
         env = copy.copy(self)
-        arms = dataclasses.replace(arms_config(self.config), reward="distance")
-        env.config = dataclasses.replace(self.config, arms=arms)
+        env._has_baseline = False
         return env
 
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> AnyArmState:
@@ -147,7 +149,7 @@ class AnyArmEnv(ImitationEnv):
             goals=first_goals(arm.home),
             plan=Plan(zeros, jnp.zeros((MAX_JOINTS, MAX_JOINTS)), zeros),
         )
-        if arms_config(self.config).reward == "relative":
+        if self._has_baseline:
             state = dataclasses.replace(state, baseline=state)
         return self.with_plan(state)
 

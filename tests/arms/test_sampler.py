@@ -43,13 +43,6 @@ def test_locked_variants_are_drawn_alike(panda):
 
 
 @pytest.mark.slow
-def test_a_limited_sampler_draws_that_many_arms():
-    draw = jax.jit(jax.vmap(sampler.limited_sampler(sampler.random_arm, 5)))
-    lengths = np.asarray(draw(jax.random.split(jax.random.PRNGKey(2), 200)).chain_length)
-    assert len(np.unique(lengths)) == 5
-
-
-@pytest.mark.slow
 def test_a_mixture_draws_from_each_sampler(panda):
     locked = sampler.lock_sampler(panda, sampler.lock_masks(7, 1))
     draw = jax.jit(jax.vmap(sampler.mixed_sampler([locked, sampler.random_arm], [0.25, 0.75])))

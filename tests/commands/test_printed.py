@@ -53,7 +53,7 @@ ENVIRONMENTS = {
     "world": mimic.env_config("panda7dof", world="hardware", learner={"locked": [2, 5]}),
     "changed world": mimic.env_config("panda4dof", world={"payload": [0.0, 1.0]}, control="joint_position"),
     "metric": mimic.env_config("planar4dof", metric="paper", limits="hardware", limit_weight=2.0),
-    "sampled arms": mimic.env_config("any_arm", arms={"distinct": 3, "unseen": ["1+2"]}),
+    "sampled arms": mimic.env_config("any_arm", arms={"most_locked": 3, "unseen": ["1+2"]}),
     "terms": mimic.env_config("panda4dof", reward={"terms": {"self_collision": 2.0}}, start="nearest"),
 }
 

@@ -24,7 +24,11 @@ def test_arms_and_world_choose_the_kind():
         ("any_arm", {"control": "joint_velocity"}, "control: expected torque without an inner loop, got joint_vel"),
         ("panda4dof", {"world": "nominal", "substeps": 20}, "substeps: expected none with an inner loop, .*, got 20"),
         ("panda4dof", {"limit_weight": 2.0}, "limit_weight: expected with limits=hardware, got 2.0"),
-        ("panda4dof", {"arms": {"distinct": 3}}, "arms: expected locked_fraction, perturbed_fraction or random_frac"),
+        (
+            "panda4dof",
+            {"arms": {"most_locked": 3}},
+            "arms: expected locked_fraction, perturbed_fraction or random_frac",
+        ),
     ],
 )
 def test_values_without_effect_are_rejected(name, fields, message):
@@ -40,7 +44,6 @@ def test_values_without_effect_are_rejected(name, fields, message):
         ({"perturbed_fraction": 1.0}, "arms: expected models and a perturbed_fraction above 0, or neither"),
         ({"random_fraction": 1.0, "unseen": ["2"]}, "arms.unseen: expected with a locked_fraction above 0"),
         ({"locked_fraction": 1.0, "unseen": ["two"]}, "arms.unseen: expected numbers of joints from 1"),
-        ({"locked_fraction": 1.0, "reward": "none"}, "arms.reward: expected one of relative, distance, got 'none'"),
         ({"locked_fraction": 1.0, "expert": "random"}, "arms.expert: expected one of fixed, drawn, got 'random'"),
     ],
 )

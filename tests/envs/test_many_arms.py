@@ -30,7 +30,7 @@ def config():
         physics="fused",
         horizon=HORIZON,
         demonstrations={"count": COUNT, "held_out": HELD_OUT},
-        arms={"random_fraction": 1.0, "reward": "distance"},
+        arms={"random_fraction": 1.0},
         metric={"hand_rotation": 0.0},
     )
 
@@ -47,7 +47,7 @@ def panda():
 
 @pytest.fixture(scope="module")
 def env(config, motions):
-    return AnyArmEnv(config, motions[0], random_arm)
+    return AnyArmEnv(config, motions[0], random_arm).by_distance()
 
 
 @pytest.fixture(scope="module")
@@ -101,9 +101,8 @@ def test_the_controller_rejects_what_arrays_do_not_cover():
 
 @pytest.fixture(scope="module")
 def compared(config, motions):
-    """An environment with the relative reward."""
-    arms = dataclasses.replace(config.arms, reward="relative")
-    return AnyArmEnv(dataclasses.replace(config, arms=arms), motions[0], random_arm)
+    """An environment whose reward compares with the zero action."""
+    return AnyArmEnv(config, motions[0], random_arm)
 
 
 @pytest.mark.slow
@@ -164,7 +163,7 @@ def test_a_runaway_ends_and_is_charged_for_all_remaining_steps(env, four_joints,
 def test_each_episode_has_a_new_arm(config, motions, panda):
     """In a batch, from random steps on, as in training."""
     masks = lock_masks(7, 1)
-    env = AnyArmEnv(config, motions[0], lock_sampler(panda, masks))
+    env = AnyArmEnv(config, motions[0], lock_sampler(panda, masks)).by_distance()
     wrapped = fresh_episodes(cast(Any, env))
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(1), 8))
     step = jax.jit(wrapped.step)
