@@ -14,10 +14,8 @@ from mimic.evaluation.virtual_robot.draws import World
 from mimic.physics.mujoco_world import FLOOR, disabled, loaded_fields
 
 START_POSE, POSITION, VELOCITY = "start pose invalid", "joint position limit", "joint velocity limit"
-TORQUE, TORQUE_RATE, EXTERNAL_TORQUE = "torque limit", "torque rate", "external torque"
-SELF_CONTACT, FLOOR_CONTACT, COMMUNICATION = "self-contact", "floor contact", "communication"
+TORQUE, TORQUE_RATE, SELF_CONTACT, FLOOR_CONTACT = "torque limit", "torque rate", "self-contact", "floor contact"
 LIMIT_CAUSES = (POSITION, VELOCITY, TORQUE, TORQUE_RATE)
-MAX_MISSING = 20  # periods in a row without a command, as for a Panda
 _ROUNDING = 1e-6  # relative, of a torque at its limit
 
 
@@ -33,7 +31,6 @@ class VirtualRobots:
     Attributes:
       qpos, qvel: true angles [rad] and velocities [rad/s], [robots, joints].
       torque: last commanded torques [N m].
-      external_torque: that acts on the joints in addition [N m]; set it to push an arm.
       cause: [robots] why a robot aborted; empty where it did not.
       periods: since the start.
     """
@@ -51,8 +48,7 @@ class VirtualRobots:
         self.qpos = np.asarray(start_poses, float) + world.start_offset
         self.qvel: np.ndarray = np.zeros(self.qpos.shape)
         self.torque: np.ndarray = np.zeros(self.qpos.shape)
-        self.external_torque: np.ndarray = np.zeros(self.qpos.shape)
-        self.cause, self._missing = np.full(count, "", object), np.zeros(count, int)
+        self.cause = np.full(count, "", object)
         self.periods = 0
         for data, qpos in zip(self._data, self.qpos, strict=True):
             data.qpos[:] = qpos
@@ -73,16 +69,12 @@ class VirtualRobots:
             qvel = qvel + self._world.velocity_noise * self._rng.standard_normal(qvel.shape)
         return qpos, np.array(qvel)
 
-    def step(self, torque: np.ndarray, is_present: np.ndarray | bool = True) -> None:
-        """One period with torques in addition to gravity compensation; without a command, the last torque acts."""
-        is_present = np.broadcast_to(is_present, self.cause.shape)
-        torque = np.where(is_present[:, None], torque, self.torque)
-        self._missing = np.where(is_present, 0, self._missing + 1)
-        self._abort(self._missing > MAX_MISSING, COMMUNICATION)
+    def step(self, torque: np.ndarray) -> None:
+        """One period with torques in addition to gravity compensation."""
         self._check_command(torque)
         self.torque = torque
         friction = friction_torque(self.qvel, self._level, self._robot.friction.rate, np)
-        applied = self._world.motor_gain * torque - friction + self.external_torque
+        applied = self._world.motor_gain * torque - friction
         for i in np.flatnonzero(self.cause == "").tolist():
             self._applied[i][:] = applied[i]
             mujoco.mj_step(self._models[i], self._data[i])
@@ -98,7 +90,6 @@ class VirtualRobots:
         is_abrupt = ~np.all(change <= limits.torque_rate * PERIOD * (1 + _ROUNDING), axis=1)  # True for NaN
         self._abort(is_abrupt, TORQUE_RATE)
         self._abort(np.any(np.abs(torque) > limits.torque * (1 + _ROUNDING), axis=1), TORQUE)
-        self._abort(np.any(np.abs(self.external_torque) > self._robot.collision_torque, axis=1), EXTERNAL_TORQUE)
 
     def _check_contacts(self, robot: int) -> None:
         data = self._data[robot]

@@ -18,7 +18,7 @@ from mimic.evaluation.virtual_robot import runs
 from mimic.evaluation.virtual_robot.driver import VirtualRobot
 from mimic.evaluation.virtual_robot.episodes import ABORTED, Channel, SafeController, run_episodes
 from mimic.evaluation.virtual_robot.loops import LOOPS
-from mimic.evaluation.virtual_robot.robots import TORQUE_RATE, VirtualRobots
+from mimic.evaluation.virtual_robot.robots import FLOOR_CONTACT, TORQUE_RATE, VirtualRobots
 from mimic.evaluation.virtual_robot.runs import Task, groups, run_task, run_tasks
 from mimic.physics.world import WorldConfig
 from tests.helpers import bundles
@@ -196,9 +196,9 @@ def test_an_aborted_robot_is_counted_once_and_at_rest(bundle):
     poses = np.array([0, 0])
     robots = VirtualRobots(model(), world(robots=2), bundle.start_poses[poses])
     controller = SafeController(bundle, poses, world(robots=2), robots)
-    robots.external_torque[1] = 100.0
+    robots.cause[1] = FLOOR_CONTACT
     episodes = run_episodes(robots, controller, poses)
-    assert list(episodes.aborts) == ["", "external torque"] and list(episodes.stops) == ["", ""]
+    assert list(episodes.aborts) == ["", FLOOR_CONTACT] and list(episodes.stops) == ["", ""]
     assert controller._layer.cause[1] == ABORTED
     assert np.all(episodes.qvel[1] == 0) and np.ptp(episodes.qpos[1], axis=0).max() == 0
     assert episodes.tracking_error[1] == 0 and episodes.tracking_error[0] > 0
