@@ -413,6 +413,7 @@ class RetargetConfig:
         return dataclasses.replace(self.env, **_without_none({"limits": limits}))
 
 
+_FOLLOWED = "free", "exact", "relative"
 _LEARNERS = "panda", "panda4dof", "panda3dof"  # to choose from in a view
 _MODEL_FILES = ".xml", ".urdf"
 
@@ -430,6 +431,9 @@ class ViewConfig:
       run: run directory of a policy to play. Its arms and demonstrations are used.
       source: motion capture file of a person to play as the expert, or tcp://localhost:PORT, a socket of this machine
         that takes points as lines of JSON.
+      demonstrations: file of the expert's demonstrations to choose from. Default "": random ones are recorded.
+      hand: how the learner's hand follows the expert's at the start: "free", "exact" or "relative", see `HandSettings`.
+      base: where the learner's base then stands, see `base_numbers`.
       arm: "left" or "right" arm of the person in `source`. Default "": right.
       capture: how `source` is read.
       checkpoint: steps of the checkpoint of the policy or the mapper. Default None: the last checkpoint.
@@ -444,6 +448,9 @@ class ViewConfig:
     learners: list[str] = dataclasses.field(default_factory=list)
     run: str = ""
     source: str = ""
+    demonstrations: str = ""
+    hand: str = "free"
+    base: Any = "same"
     arm: str = ""
     capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
     checkpoint: int | None = checkpoint_number()
@@ -465,6 +472,15 @@ class ViewConfig:
             raise ValueError("arm, capture: expected only with source=")
         if self.arm:
             check_choice("arm", self.arm, ARM_SIDES)
+        if self.demonstrations and (self.run or self.source):
+            raise ValueError("demonstrations: expected none with run= or source=, whose motions are shown")
+        check_choice("hand", self.hand, _FOLLOWED)
+        if self.hand != "free" and (self.run or self.mapper):
+            raise ValueError("hand: expected free with run= or mapper=, which move the learner")
+        if self.base != "same" and (self.hand == "free" or base_numbers(self.base) is None):
+            raise ValueError(
+                "base: expected same or [x,y,z,yaw] with hand=exact or relative; inspect base=auto finds one"
+            )
 
     def resolve_learners(self, own: ArmConfig) -> dict[str, ArmConfig]:
         """The arms to choose from, by the name that the page shows.

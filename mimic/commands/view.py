@@ -12,7 +12,7 @@ from rich.console import Console
 from mimic.arms.arm import ArmConfig
 from mimic.base import compat
 from mimic.base.distribution import install_command
-from mimic.commands.config import ViewConfig
+from mimic.commands.config import ViewConfig, base_numbers
 from mimic.commands.view_capture import (
     CapturedExpert,
     clip_expert,
@@ -24,8 +24,10 @@ from mimic.commands.view_capture import (
 )
 from mimic.commands.view_server import check_port, is_installed, serve
 from mimic.envs.config import EnvConfig
+from mimic.motions.demonstrations import load_demonstrations
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.run_config import policy_run
+from mimic.viewer.hand_following import HandSettings
 from mimic.viewer.live_session import LiveSession
 
 if TYPE_CHECKING:
@@ -62,7 +64,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     if config.source:
         return _prepare_captured(config, config.env)
     if not config.mapper:
-        return _prepare_live(config, config.env, LiveSession(config.env))
+        return _prepare_live(config, config.env, LiveSession(config.env, hand=_hand(config)))
     return _prepare_mapper(config)
 
 
@@ -73,17 +75,31 @@ def _prepare_live(
     learners: Mapping[str, ArmConfig] | None = None,
     presets: "Sequence[Preset]" = (),
 ) -> Callable[[], int]:
-    """Prepares a view whose expert the user moves; `learners` as of `serve`, `presets` as of `LearnerControls`."""
+    """Prepares a view whose expert the user moves; `learners` as of `serve`, `presets` as of `LearnerControls`.
+
+    Raises:
+      ValueError: demonstrations that cannot be read or are another arm's.
+    """
+    demonstrations = None
+    if config.demonstrations:
+        demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
+        demonstrations.check_fits(session.expert, demonstrations.dt, demonstrations.horizon)
 
     def show_session(page: "Page", times: Iterator[float]) -> None:
         from mimic.viewer.learner_controls import LearnerControls
         from mimic.viewer.live_page import show_live
         from mimic.viewer.manual_controls import ManualControls
 
-        expert = ManualControls(session, env)
+        expert = ManualControls(session, env, demonstrations)
         show_live(page, times, session, env, expert, LearnerControls(session, page.starts, presets))
 
     return lambda: serve(config, env, _title(config, env), show_session, None, session.finish, learners=learners)
+
+
+def _hand(config: ViewConfig) -> HandSettings:
+    """How the learner's hand follows at the start."""
+    x, y, z, yaw = base_numbers(config.base) or [0.0] * 4
+    return HandSettings(config.hand, base=(x, y, z, yaw))
 
 
 def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
@@ -133,7 +149,7 @@ def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
     """Checks the captured person of `source`; the returned function shows it."""
 
     def show(expert: CapturedExpert) -> int:
-        live = LiveSession(expert.env)
+        live = LiveSession(expert.env, hand=_hand(config))
 
         def show_session(page: "Page", times: Iterator[float]) -> None:
             from mimic.viewer.learner_controls import LearnerControls

@@ -148,6 +148,13 @@ class Teleoperator:
         self.is_engaged, self._goal = False, None
         self._samples.forget()
 
+    @property
+    def goal(self) -> tuple[Float[np.ndarray, "hands 3"], Float[np.ndarray, "hands 3 3"]] | None:
+        """Positions [m] and rotations that the follower's hands are driven to, in its base frame; None without one."""
+        if self._goal is None:
+            return None
+        return self._goal.position * self._rows[1].unit, np.swapaxes(self._goal.axes, 1, 2)
+
     def step(self, leader_qpos: Any, gripper: float | None = None, time: float | None = None) -> FollowerCommand:
         """The command of the next tick.
 

@@ -1,4 +1,4 @@
-"""The controls of a live view: those of the expert, of the metric and of the learner, each in a tab."""
+"""The controls of a live view: those of the expert, of the metric, of the learner and of its hand, each in a tab."""
 
 from typing import Protocol
 
@@ -6,6 +6,7 @@ import viser
 
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import CORRESPONDENCES
+from mimic.viewer.hand_controls import HandControls
 from mimic.viewer.learner_controls import LearnerControls
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.manual_controls import by_user
@@ -46,6 +47,7 @@ class LiveControls:
         learner: LearnerControls,
     ):
         self._server, self._session, self._env = server, session, env
+        self._learner, self._hand = learner, HandControls(session) if session.by_optimiser else None
         tabs = server.gui.add_tab_group()
         with tabs.add_tab("Expert"):
             expert.add_widgets(server)
@@ -53,6 +55,15 @@ class LiveControls:
             self._add_metric()
         with tabs.add_tab("Learner"):
             learner.add_widgets(server)
+        if self._hand is not None:
+            with tabs.add_tab("Hand"):
+                self._hand.add_widgets(server)
+
+    def update(self) -> None:
+        """Shows the settings of the session, after one that was not possible."""
+        self._learner.update()
+        if self._hand is not None:
+            self._hand.update()
 
     def _add_metric(self) -> None:
         gui, session, settings = self._server.gui, self._session, self._session.settings

@@ -23,7 +23,7 @@ def show_live(
     numbers_rate: float = math.inf,
 ) -> None:
     """Moves the arms at each tick, and shows numbers, chart and maps at a rate [1/s]."""
-    LiveControls(page.server, live, env, expert, learner)
+    controls = LiveControls(page.server, live, env, expert, learner)
     history, frame, was_compiling, since_numbers = History(), None, True, 0.0
     is_behind = False  # whether the numbers are older than the arms
     for dt in times:
@@ -35,7 +35,7 @@ def show_live(
             for client in page.server.get_clients().values():
                 client.add_notification("not possible", str(error), color="red", auto_close_seconds=6.0)
             new_frame = None
-            learner.update()  # a lock that is not possible has been undone
+            controls.update()  # what is not possible has been undone
         compiling = live.is_compiling
         changed = new_frame is not None or (compiling != was_compiling and frame is not None)
         is_behind |= changed
@@ -53,6 +53,8 @@ def show_live(
 def _note(frame: Frame, compiling: bool, by_optimiser: bool) -> str:
     if compiling:
         return "compiling …"
+    if frame.hand is not None:
+        return frame.hand.note
     excess = frame.distance - frame.bound
     if excess <= _AT_BOUND * max(frame.distance, _AT_BOUND):
         return "at the kinematic bound"

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import threading
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -12,9 +12,11 @@ from jaxtyping import Float
 from mimic.arms.arm import build_arm, finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import EnvConfig
+from mimic.viewer.hand_following import FREE, HandDrag, HandFollower, HandFrame, HandSettings
 from mimic.viewer.tracking import (
     CompiledFunctions,
     FunctionCache,
+    FunctionSource,
     Mapper,
     PoseComparison,
     Settings,
@@ -28,6 +30,7 @@ _GLIDE = 1.0  # s, duration of the expert's motion to the pose of a button
 _REST_TIME = 0.25  # s that the expert rests before the learner may leave a local minimum
 _REST_ANGLE = 1e-4  # rad; a joint that moves less is at rest
 _MIN_GAIN = 1e-3  # fraction of the distance that another minimum must save
+_SETTLED = 2.0  # s that the expert rests before a hand that follows counts as at rest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +47,7 @@ class Frame:
       links: weighted distance D' of every pair of links.
       similarity: measures of `mimic.metric.similarity` by name.
       arm: index of the learner among the arms that can be chosen.
+      hand: of a learner whose hand follows the expert's.
     """
 
     expert: Mapping[str, float]
@@ -57,24 +61,7 @@ class Frame:
     links: Float[np.ndarray, "expert learner"]
     similarity: Mapping[str, float]
     arm: int = 0
-
-
-class FunctionSource(Protocol):
-    """Functions that move the learner, by settings; see `FunctionCache`."""
-
-    def get(self, settings: Settings) -> CompiledFunctions | None:
-        """The functions; None until those that move the learner are compiled."""
-
-    def is_complete(self, settings: Settings) -> bool:
-        """Whether all functions are compiled, or their compilation has failed."""
-        ...
-
-    def wait(self, settings: Settings) -> CompiledFunctions:
-        """Waits for all functions and returns them."""
-        ...
-
-    def finish(self) -> None:
-        """Waits for a running compilation: a process must not end during it."""
+    hand: HandFrame | None = None
 
 
 class LiveSession:
@@ -85,10 +72,12 @@ class LiveSession:
       mapper: pose mapper that moves the learner instead of the optimiser.
       any_arm: functions of a pose mapper to any arm; with these, the learner can be changed, and a joint is locked
         where it is instead of at its angle in the start pose.
+      hand: how the learner's hand follows, at the start.
 
     Attributes:
       expert: embodiment of the expert.
       settings: requested settings; they take effect as soon as their functions are compiled.
+      hand: how the learner's hand follows, with the optimiser.
       by_optimiser: whether the optimiser moves the learner, not a pose mapper.
       takes_any_arm: whether the learner can be changed.
 
@@ -96,7 +85,14 @@ class LiveSession:
       ValueError: an arm is invalid.
     """
 
-    def __init__(self, env: EnvConfig, mapper: Mapper | None = None, any_arm: FunctionSource | None = None):
+    def __init__(
+        self,
+        env: EnvConfig,
+        mapper: Mapper | None = None,
+        any_arm: FunctionSource | None = None,
+        hand: HandSettings | None = None,
+    ):
+        self.hand: HandSettings = hand or HandSettings()
         self.expert: Embodiment = build_arm(env.expert, env.limits, env.metric.links).embodiment
         self.settings: Settings = initial_settings(env)
         self.by_optimiser, self.takes_any_arm = mapper is None and any_arm is None, any_arm is not None
@@ -111,6 +107,7 @@ class LiveSession:
         self._goal: np.ndarray | None = None  # pose of the learner to move to instead of the optimiser's
         self._seeks = False  # whether the learner is on its way to the best pose while the expert moves
         self._solved: tuple[Any, np.ndarray, float] | None = None  # request, best pose and bound
+        self._drag, self._follower = HandDrag(self.expert), HandFollower(self.expert, env)
         self._active = self.settings  # the last settings with compiled functions
         self._rest_key: Any = None  # request for which the learner is at rest
 
@@ -121,25 +118,33 @@ class LiveSession:
 
     @property
     def moves_by_itself(self) -> bool:
-        """Whether the expert moves to a pose or along a demonstration."""
-        return self._motion is not None
+        """Whether the expert moves to a pose, along a demonstration, or with its dragged hand."""
+        return self._motion is not None or self._drag.goal is not None
 
     def move(self, joint: int, angle: float) -> None:
         """Sets one joint of the expert to an angle [rad] and stops any motion; NaN and infinity are dropped."""
         if not math.isfinite(angle):
             return
         with self._lock:
-            self._motion = None
+            self.stop()
             pose = self.pose
             pose[joint] = np.clip(angle, *self.expert.joint_range[joint])
             self._pose, self._rest_time, self._goal = pose, 0.0, None
+
+    def drag_hand(self, goal: Float[np.ndarray, "4 4"]) -> None:
+        """Moves the expert's first hand to a pose in its base frame [m], as near as it gets; NaN is dropped."""
+        if not np.all(np.isfinite(goal)):
+            return
+        with self._lock:
+            self._motion, self._goal, self._drag.goal = None, None, goal
 
     def show_pose(self, pose: Float[np.ndarray, " joints"]) -> None:
         """Sets the expert's pose [rad], one of a motion: the learner tracks it from where it is."""
         if not np.all(np.isfinite(pose)):
             return
         with self._lock:
-            self._motion, self._pose, self._rest_time = None, np.asarray(pose, np.float32), 0.0
+            self.stop()
+            self._pose, self._rest_time = np.asarray(pose, np.float32), 0.0
 
     def seek(self) -> None:
         """Moves the learner to the best pose of many initial guesses before it tracks again; for motions that jump."""
@@ -153,12 +158,23 @@ class LiveSession:
     def play(self, times: Float[np.ndarray, " samples"], poses: Float[np.ndarray, "samples joints"]) -> None:
         """Moves the expert along poses [rad] at times [s]."""
         with self._lock:
+            self._drag.goal = None
             self._motion, self._time, self._goal = (times, np.asarray(poses, np.float32)), 0.0, None
 
     def stop(self) -> None:
         """Stops the motion of the expert."""
         with self._lock:
-            self._motion = None
+            self._motion = self._drag.goal = None
+
+    def follow_hand(self, **settings: Any) -> None:
+        """Changes some of the `HandSettings`.
+
+        Raises:
+          ValueError: a value is invalid.
+        """
+        with self._lock:
+            self.hand = dataclasses.replace(self.hand, **settings)
+            self._goal = self._rest_key = None
 
     def change(self, **settings: Any) -> None:
         """Changes some of the `Settings`.
@@ -218,17 +234,22 @@ class LiveSession:
             if self._rest_key == (request, functions.best is None):
                 return None
             best, bound = self._best(functions, request)
-            pose = self._step(functions, current, best, bound, settings.weights, dt)
+            hand = None
+            if self.hand.hand == FREE:
+                self._follower.stop()
+                pose = self._step(functions, current, best, bound, settings.weights, dt)
+            else:
+                pose, hand = self._follow_hand(arm, current, dt)
             comparison = functions.compare(expert, pose, settings.weights)
             self._angles |= dict(zip(arm.joint_names, map(float, pose), strict=True))
             self._angles |= functions.learner.locked
             is_at_rest = (
                 self._goal is None
-                and self._rest_time > 2 * _REST_TIME
+                and self._rest_time > (2 * _REST_TIME if hand is None else _SETTLED)
                 and bool(np.all(np.abs(pose - current) < _REST_ANGLE))
             )
             self._rest_key = (request, functions.best is None) if is_at_rest else None
-            return self._frame(functions, comparison, bound)
+            return self._frame(functions, comparison, bound, hand)
 
     def _activate_functions(self) -> CompiledFunctions | None:
         """The functions of the requested settings, or until these are compiled, of the previous settings."""
@@ -242,7 +263,23 @@ class LiveSession:
         self._active = self.settings
         return functions
 
-    def _frame(self, functions: CompiledFunctions, comparison: PoseComparison, bound: float) -> Frame:
+    def _follow_hand(self, arm: Embodiment, current: np.ndarray, dt: float) -> tuple[np.ndarray, HandFrame]:
+        """The learner's next pose with a hand that follows; it starts where the learner is.
+
+        Raises:
+          ValueError: the settings are not possible; the hand is left to the metric.
+        """
+        try:
+            qpos, hand = self._follower.step(self.hand, self._active.locked, current, self._pose, dt)
+        except ValueError:
+            self.hand = dataclasses.replace(self.hand, hand=FREE)
+            raise
+        jump = finite_velocity_limit(arm) * dt
+        return np.asarray(step_towards(arm, current, qpos, jump)[0], np.float32), hand
+
+    def _frame(
+        self, functions: CompiledFunctions, comparison: PoseComparison, bound: float, hand: HandFrame | None
+    ) -> Frame:
         distance = float(comparison.distance)
         return Frame(
             expert=dict(zip(self.expert.joint_names, map(float, self._pose), strict=True)),
@@ -256,10 +293,13 @@ class LiveSession:
             links=np.asarray(comparison.links),
             similarity={name: float(value) for name, value in comparison.similarity.items()},
             arm=self._active.arm,
+            hand=hand,
         )
 
     def _advance_expert(self, dt: float) -> None:
         self._rest_time += dt
+        if self._drag.goal is not None:
+            self._pose, self._rest_time = self._drag.step(self._pose, dt), 0.0
         if self._motion is None:
             return
         times, poses = self._motion

@@ -10,13 +10,18 @@ from jaxtyping import Float
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.link_match import LinkMatch
 from mimic.viewer import html
+from mimic.viewer.hand_following import HandFrame
 from mimic.viewer.live_session import Frame
-from mimic.viewer.meshes import ArmShape, Part, along_z, capsule_mesh, places
+from mimic.viewer.meshes import ArmShape, Part, along_z, capsule_mesh, places, quaternion
 
 _GRID = 0.1, 0.5  # m, sizes of a cell and of a section
 _STANCE = np.array([2.5, -0.1, 0.75])  # camera position relative to its target, in arm lengths
 _FROM_ABOVE = np.array([0.55, -0.01, 2.9])
 _FIELD_OF_VIEW = 0.75  # rad, vertical
+EXPERT_BASE = "/expert/base"  # base frame of the expert
+_GOAL_SIZE, _GOAL_BALL = 0.12, 0.035  # axes of a goal of the hand, and the ball in it, in chain lengths
+_STATE_COLOURS = {"tracking": (60, 170, 80), "nearest": (215, 40, 40)}  # of the ball by the state of a hand
+_OTHER_STATE = (240, 160, 30)
 _PANEL_WIDTH = 384.0  # pixels; the heat maps of two arms with seven joints fit
 
 
@@ -65,6 +70,7 @@ class Page:
         _set_stage(server, reach, is_flat)
         (left, right), label_at = places([self.expert, largest]), -0.3 if is_flat else 0.3
         self._expert = _DrawnArm(server, "/expert", self.expert, left, f"expert: {expert[0]}", label_at)
+        _add_base(server, EXPERT_BASE, self.expert)
         self._learners = [
             _DrawnLearner(server, f"/learner{index}", learner, right, label_at)
             for index, learner in enumerate(learners)
@@ -148,6 +154,7 @@ class _DrawnLearner:
     def __init__(self, server: viser.ViserServer, path: str, learner: LearnerShape, place: np.ndarray, label_at: float):
         self._arm = _DrawnArm(server, path, learner.shape, place, f"learner: {learner.name}", label_at)
         self._ghost = _Ghost(server, path, learner.shape, learner.match)
+        self._goals = _HandGoals(server, path, learner.shape, len(learner.match.learner.hand_joint))
 
     def show(self, frame: Frame, is_chosen: bool) -> None:
         """Shows the learner in a frame, or hides it."""
@@ -155,7 +162,8 @@ class _DrawnLearner:
             self._arm.root.visible = is_chosen
         if is_chosen:
             self._arm.move_to(frame.learner, frame.locked)
-            self._ghost.move_to(frame)
+            self._ghost.show(frame)
+            self._goals.show(frame.hand)
 
 
 class _Ghost:
@@ -166,9 +174,8 @@ class _Ghost:
 
     def __init__(self, server: viser.ViserServer, learner: str, shape: ArmShape, match: LinkMatch):
         self._match = match
-        position, wxyz = shape.base_pose()
         scene, path = server.scene, f"{learner}/ghost"
-        scene.add_frame(path, show_axes=False, position=position, wxyz=wxyz)
+        self._root = _add_base(server, path, shape)
         at_rest = match.ghost(np.zeros(match.expert.num_joints), np.zeros(match.learner.num_joints))
         self._num_links = match.expert.num_links
         self._links = []
@@ -180,7 +187,14 @@ class _Ghost:
         count = len(at_rest) - self._num_links
         self._lines = scene.add_line_segments(f"{path}/lines", np.zeros((count, 2, 3), np.float32), colors=(40, 40, 40))
 
-    def move_to(self, frame: Frame) -> None:
+    def show(self, frame: Frame) -> None:
+        """Shows the expert in a frame; hides it, as it is scaled, where hands are compared in metres."""
+        if self._root.visible != (frame.hand is None):
+            self._root.visible = frame.hand is None
+        if frame.hand is None:
+            self._move_to(frame)
+
+    def _move_to(self, frame: Frame) -> None:
         arms = (self._match.expert, frame.expert), (self._match.learner, frame.learner)
         poses = [np.array([angles[name] for name in arm.joint_names]) for arm, angles in arms]
         capsules = self._match.ghost(*poses)
@@ -188,6 +202,37 @@ class _Ghost:
             mesh.position, mesh.wxyz = capsule.start, along_z(capsule.end - capsule.start)
         lines = [(capsule.start, capsule.end) for capsule in capsules[self._num_links :]]
         self._lines.points = np.asarray(lines, np.float32).reshape(-1, 2, 3)
+
+
+class _HandGoals:
+    """Axes where the learner's hands should be, each with a ball whose colour is the state of the hand."""
+
+    def __init__(self, server: viser.ViserServer, learner: str, shape: ArmShape, count: int):
+        scene, path = server.scene, f"{learner}/goals"
+        _add_base(server, path, shape)
+        size, ball = _GOAL_SIZE * shape.reach, _GOAL_BALL * shape.reach
+        names = [f"{path}/{hand}" for hand in range(count)]
+        self._axes = [scene.add_frame(name, axes_length=size, axes_radius=0.04 * size, visible=False) for name in names]
+        self._balls = [
+            scene.add_icosphere(f"{name}/ball", ball, color=_OTHER_STATE, opacity=0.6, cast_shadow=False)
+            for name in names
+        ]
+
+    def show(self, hand: HandFrame | None) -> None:
+        """Shows the goals of a hand that follows."""
+        for axes, ball, number in zip(self._axes, self._balls, range(len(self._axes)), strict=True):
+            is_shown = hand is not None and number < len(hand.positions)
+            if axes.visible != is_shown:
+                axes.visible = is_shown
+            if hand is not None and is_shown:
+                axes.position, axes.wxyz = hand.positions[number], quaternion(hand.rotations[number])
+                ball.color = _STATE_COLOURS.get(hand.status.state, _OTHER_STATE)
+
+
+def _add_base(server: viser.ViserServer, path: str, shape: ArmShape) -> Any:
+    """Adds the base frame of an arm."""
+    position, wxyz = shape.base_pose()
+    return server.scene.add_frame(path, show_axes=False, position=position, wxyz=wxyz)
 
 
 def _mesh(scene: viser.SceneApi, path: str, part: Part) -> Any:

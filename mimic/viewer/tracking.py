@@ -5,7 +5,7 @@ import functools
 import math
 import threading
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import numpy as np
@@ -200,6 +200,24 @@ def _metric_of_weights(
 def compiled(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
     """The function, compiled for arguments of these shapes; it never compiles again."""
     return jax.jit(function).lower(*shapes).compile()
+
+
+class FunctionSource(Protocol):
+    """Functions that move the learner, by settings; see `FunctionCache`."""
+
+    def get(self, settings: Settings) -> CompiledFunctions | None:
+        """The functions; None until those that move the learner are compiled."""
+
+    def is_complete(self, settings: Settings) -> bool:
+        """Whether all functions are compiled, or their compilation has failed."""
+        ...
+
+    def wait(self, settings: Settings) -> CompiledFunctions:
+        """Waits for all functions and returns them."""
+        ...
+
+    def finish(self) -> None:
+        """Waits for a running compilation: a process must not end during it."""
 
 
 class FunctionCache:

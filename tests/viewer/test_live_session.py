@@ -7,6 +7,7 @@ import pytest
 
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm, finite_velocity_limit
+from mimic.arms.link_match import hand_poses
 from mimic.envs import env_config
 from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
@@ -140,6 +141,26 @@ def test_weights_change_without_compiling_and_the_distance_scales(live):
     live.change(translation=2.0, rotation=2.0)
     frame = live.advance(TICK)
     assert frame is not None and frame.distance == pytest.approx(2 * before, rel=1e-3)  # the minimum stays in its place
+
+
+def test_a_hand_that_follows_is_where_the_dragged_one_of_the_expert_is(live, env):
+    """A relative hand of half the scale; an impossible setting leaves the hand to the metric, with an error."""
+    settle(live)
+    live.follow_hand(hand="relative", scale=0.5)
+    start = live.advance(TICK)
+    goal = hand_poses(live.expert, live.pose)[0]
+    goal[:3, 3] += [0.1, 0.0, -0.08]
+    live.drag_hand(goal)
+    assert live.moves_by_itself
+    frame = settle(live, 12.0)
+    np.testing.assert_allclose(hand_poses(live.expert, live.pose)[0], goal, atol=1e-3)
+    assert start.hand is not None and frame.hand is not None
+    np.testing.assert_allclose(frame.hand.positions - start.hand.positions, [[0.05, 0.0, -0.04]], atol=1e-3)
+    assert frame.hand.status.state == "nearest" and "joint4 at the limit" in frame.hand.note
+    with pytest.raises(ValueError, match="scale"):
+        live.follow_hand(scale=0.0)
+    live.follow_hand(hand="free")
+    assert settle(live).hand is None
 
 
 @pytest.mark.slow

@@ -1,0 +1,168 @@
+"""A learner of a live view whose hand does what the expert's does, and an expert whose hand is dragged. No browser."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mimic.arms.arm import build_arm, finite_velocity_limit
+from mimic.arms.embodiment import Embodiment
+from mimic.base.config import check_choice
+from mimic.envs.config import EnvConfig
+from mimic.metric.config import MetricConfig
+from mimic.retargeting.live_pose import ArmRows, LivePose
+from mimic.retargeting.teleoperation import HANDS as FOLLOWED
+from mimic.retargeting.teleoperation import TeleoperationStatus, Teleoperator
+
+FREE = "free"
+HANDS = (FREE, *FOLLOWED)
+_RATE = 100.0  # ticks of the teleoperator per second
+_STEPS = 4  # of a dragged pose in a frame
+_AT_HAND = 1e-4  # rad; a dragged pose that moves less in a frame has arrived, or gets no nearer
+
+
+@dataclasses.dataclass(frozen=True)
+class HandSettings:
+    """How the learner's hand follows the expert's; the user can change it while the viewer runs.
+
+    Attributes:
+      hand: "free" leaves it to the metric; "exact" and "relative" as of `Teleoperator`.
+      is_engaged: whether the clutch is engaged.
+      base: of the learner in the expert's base frame, [x, y, z, yaw] [m, rad].
+      scale, mirror: as of `Teleoperator`.
+    """
+
+    hand: str = FREE
+    is_engaged: bool = True
+    base: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    scale: float = 1.0
+    mirror: bool = False
+
+    def __post_init__(self) -> None:
+        check_choice("hand", self.hand, HANDS)
+        if not all(map(math.isfinite, self.base)):
+            raise ValueError(f"base: expected finite numbers [m, rad], got {list(self.base)}")
+        if not 0 < self.scale < math.inf:
+            raise ValueError(f"scale: expected a finite number above 0, got {self.scale}")
+
+
+class HandFrame(NamedTuple):
+    """What is shown of a hand that follows.
+
+    Attributes:
+      positions, rotations: goals of the learner's hands in its base frame [m]; none before the first one.
+      status: of the teleoperator.
+    """
+
+    positions: Float[np.ndarray, "hands 3"]
+    rotations: Float[np.ndarray, "hands 3 3"]
+    status: TeleoperationStatus
+
+    @property
+    def note(self) -> str:
+        """The status in words."""
+        state, reason, position, rotation = self.status
+        error = "" if math.isnan(position) else f", {position:.1f} mm and {rotation:.1f} deg from its goal"
+        return f"hand {state}{error}" + (f"\n{reason}" if reason else "")
+
+
+class HandFollower:
+    """Moves the learner of an environment by a teleoperator, within the limits of its model."""
+
+    def __init__(self, expert: Embodiment, env: EnvConfig):
+        self._expert, self._env = expert, env
+        self._teleoperator: Teleoperator | None = None
+        self._made_of: Any = None  # what the teleoperator is made of
+        self._is_engaged, self._left = False, 0.0
+
+    def stop(self) -> None:
+        """Forgets the motion; the next step begins where the learner is then."""
+        self._teleoperator = None
+
+    def step(
+        self,
+        settings: HandSettings,
+        locked: Mapping[str, float],
+        qpos: Float[np.ndarray, " learner_joints"],
+        expert_qpos: Float[np.ndarray, " joints"],
+        dt: float,
+    ) -> tuple[Float[np.ndarray, " learner_joints"], HandFrame]:
+        """The learner's pose [rad] after a time [s], and what is shown of its hand.
+
+        Args:
+          settings: of the teleoperator; others begin anew from `qpos`.
+          locked: joints of the learner [rad].
+          qpos: the learner's pose [rad].
+          expert_qpos: the expert's pose [rad].
+          dt: the time [s].
+
+        Raises:
+          ValueError: see `Teleoperator`.
+        """
+        made_of = dataclasses.replace(settings, is_engaged=True), tuple(locked.items())
+        if self._teleoperator is None or self._made_of != made_of:
+            self._teleoperator, self._made_of = self._make(settings, locked, qpos), made_of
+            self._is_engaged, self._left = False, 0.0
+        operator = self._teleoperator
+        if settings.is_engaged != self._is_engaged:
+            (operator.engage if settings.is_engaged else operator.disengage)()
+            self._is_engaged = settings.is_engaged
+        ticks = max(int(self._left + dt * _RATE), 1)
+        self._left = max(self._left + dt * _RATE - ticks, 0.0)
+        for _ in range(ticks):
+            command = operator.step(expert_qpos)
+        goal = operator.goal or (np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        return command.qpos, HandFrame(*goal, command.status)
+
+    def _make(self, settings: HandSettings, locked: Mapping[str, float], qpos: np.ndarray) -> Teleoperator:
+        config = dataclasses.replace(self._env.learner, home=None, locked=dict(locked))
+        arm = build_arm(config, "hardware", self._env.metric.links).embodiment
+        hand: Any = settings.hand
+        operator = Teleoperator(
+            self._expert, arm, hand=hand, base=settings.base, scale=settings.scale, mirror=settings.mirror,
+            rate=_RATE, velocity=finite_velocity_limit(arm), metric=self._env.metric,
+        )  # fmt: skip
+        operator.reset(np.clip(qpos, *operator.limits.position.T))
+        return operator
+
+
+class HandDrag:
+    """Moves an arm so that its first hand goes to where the user drags it; other hands stay.
+
+    Args:
+      arm: with hands, before anything is dragged.
+
+    Attributes:
+      goal: of the hand in the base frame [m]; None while nothing is dragged.
+    """
+
+    def __init__(self, arm: Embodiment):
+        self._arm, self._rows = arm, ArmRows(arm)
+        self.goal: Float[np.ndarray, "4 4"] | None = None
+
+    @functools.cached_property
+    def _pose(self) -> LivePose:
+        hands = np.arange(self._rows.hands)
+        metric = MetricConfig().build(self._arm, self._arm)
+        return LivePose(self._rows, self._rows, np.stack([hands, hands], axis=1), metric)
+
+    def step(self, qpos: Float[np.ndarray, " joints"], dt: float) -> Float[np.ndarray, " joints"]:
+        """The pose [rad] after a time [s], within ranges and velocity limits; the drag ends where it gets no nearer."""
+        if self.goal is None:
+            return qpos
+        start, reach = np.asarray(qpos, float), finite_velocity_limit(self._arm) * dt
+        lower, upper = np.asarray(self._arm.joint_range).T
+        lower, upper = np.maximum(lower, start - reach), np.minimum(upper, start + reach)
+        rows = self._rows(start[None])
+        position, axes = (x[0].copy() for x in self._rows.hand(rows))
+        position[0], axes[0] = self.goal[:3, 3] / self._rows.unit, self.goal[:3, :3].T
+        goal, pose = self._pose.goal(rows, position, axes, np.eye(3)), start[None]
+        for _ in range(_STEPS):
+            pose, _ = self._pose.step(goal, pose, lower, upper)
+        if np.abs(pose[0] - start).max() < _AT_HAND:
+            self.goal = None
+        return pose[0].astype(qpos.dtype)
