@@ -172,10 +172,8 @@ def followed_by_ssik(arm: Embodiment, targets: np.ndarray, start: np.ndarray) ->
     return np.stack(path[1:])
 
 
-def followed_by_mink(arm: Embodiment, targets: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Ten steps of mink from the last pose at each time."""
-    import mink
-
+def mink_model(arm: Embodiment) -> mujoco.MjModel:
+    """A model of an arm's joints and ranges, with a site `hand`."""
     spec = mujoco.MjSpec()
     spec.compiler.autolimits, spec.compiler.degree = False, False
     body, origin = spec.worldbody, np.zeros(3)
@@ -188,7 +186,14 @@ def followed_by_mink(arm: Embodiment, targets: np.ndarray, start: np.ndarray) ->
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, np.asarray(arm.hand_rotation[0]).ravel())
     body.add_site(name="hand", pos=arm.hand_position[0] - origin, quat=quaternion)
-    model = spec.compile()
+    return spec.compile()
+
+
+def followed_by_mink(arm: Embodiment, targets: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Ten steps of mink from the last pose at each time."""
+    import mink
+
+    model = mink_model(arm)
     configuration, limits = mink.Configuration(model, start.astype(float)), [mink.ConfigurationLimit(model)]
     task, path = mink.FrameTask("hand", "site", 1.0, 1.0, lm_damping=1e-3), []
     for target in targets:

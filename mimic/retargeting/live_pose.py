@@ -27,17 +27,14 @@ class Goal(NamedTuple):
     """What a follower is pulled to, in its base frame and in its chain lengths.
 
     Attributes:
-      position: [hands, 3] of the hands.
-      axes: [hands, 3, 3] their x-, y- and z-axes, one a row.
-      units, strengths: [links, 3], [links] of the pulls on directions of links.
       points: [leader_links, 3] positions of the leader's links, in its own chain lengths.
+      rows: [rows, 3] of the follower's hand positions, link directions and hand axes.
+      stiffness: [rows] of these pulls.
     """
 
-    position: Float[np.ndarray, "hands 3"]
-    axes: Float[np.ndarray, "hands 3 3"]
-    units: Float[np.ndarray, "links 3"]
-    strengths: Float[np.ndarray, " links"]
     points: Float[np.ndarray, "leader_links 3"]
+    rows: Float[np.ndarray, "rows 3"]
+    stiffness: Float[np.ndarray, " rows"]
 
 
 class Rows(NamedTuple):
@@ -66,9 +63,9 @@ class ArmRows:
         self.unit, joints, self.links = float(arm.chain_length), arm.num_joints, arm.num_links
         axis, anchor = np.asarray(arm.joint_axis, float), np.asarray(arm.joint_anchor, float) / self.unit
         skew = np.cross(np.eye(3), axis[:, None])
-        self._sine, self._versine = np.zeros((2, joints, 4, 4))
+        self._sine, self._versine = np.zeros((2, joints, 1, 4, 4))
         for matrix, part in ((self._sine, skew), (self._versine, skew @ skew)):
-            matrix[:, :3, :3], matrix[:, :3, 3] = part, -(part @ anchor[..., None])[..., 0]
+            matrix[:, 0, :3, :3], matrix[:, 0, :3, 3] = part, -(part @ anchor[..., None])[..., 0]
         self._parents, self.knows_roll = arm.joint_parent, bool(arm.hand_joint)
         positions, rotations, hand_joint = _hands(arm)
         self.hands = len(hand_joint)
@@ -76,7 +73,7 @@ class ArmRows:
         directions = [axis, arm.link_rotation[:, :, 0], np.swapaxes(rotations, 1, 2).reshape(-1, 3)]
         order = points[0], directions[0], points[1], points[2], directions[1], directions[2]
         is_point = np.repeat([1.0, 0.0, 1.0, 1.0, 0.0, 0.0], [len(rows) for rows in order])
-        self._zero = np.concatenate([np.concatenate(order), is_point[:, None]], axis=1)[..., None]
+        self._zero = np.concatenate([np.concatenate(order), is_point[:, None]], axis=1)[:, None, :, None]
         of_rows = [*arm.link_joint, *hand_joint, *arm.link_joint, *np.repeat(hand_joint, 3)]
         self._frame = np.array([*range(joints), *range(joints), *of_rows]) + 1
         self._joints, self._is_point = joints, is_point[2 * joints :]
@@ -84,13 +81,13 @@ class ArmRows:
 
     def __call__(self, qpos: Float[np.ndarray, "lanes joints"]) -> Rows:
         """The rows at joint angles [rad]."""
-        angle = qpos[..., None, None]
-        steps = np.eye(4) + np.sin(angle) * self._sine + (1 - np.cos(angle)) * self._versine
-        frames = np.empty((len(qpos), self._joints + 1, 4, 4))
-        frames[:, 0] = np.eye(4)
+        angle = qpos.T[..., None, None]
+        steps = _IDENTITY + np.sin(angle) * self._sine + (1 - np.cos(angle)) * self._versine
+        frames = np.empty((self._joints + 1, len(qpos), 4, 4))
+        frames[0] = _IDENTITY
         for joint, parent in enumerate(self._parents):
-            np.matmul(frames[:, parent + 1], steps[:, joint], out=frames[:, joint + 1])
-        rows = (frames[:, self._frame] @ self._zero)[..., :3, 0]
+            np.matmul(frames[parent + 1], steps[joint], out=frames[joint + 1])
+        rows = (frames[self._frame] @ self._zero)[..., :3, 0].swapaxes(0, 1)
         return Rows(rows[:, : self._joints], rows[:, self._joints : 2 * self._joints], rows[:, 2 * self._joints :])
 
     def hand(self, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
@@ -105,6 +102,7 @@ class ArmRows:
         return (cross @ np.swapaxes(rows.moving, 1, 2)[:, None] - moments * self._is_point) * self._moves
 
 
+_IDENTITY = np.eye(4)
 _LEVI_CIVITA = -np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshape(3, 9) * -1.0
 
 
@@ -144,12 +142,15 @@ class LivePose:
         if not metric.is_weighted_sum:
             raise ValueError("metric: expected a constant correspondence, constant weights and the reduction mean")
         factors = np.asarray(metric.factors(leader.hands, follower.hands))[:, : leader.links, : follower.links]
-        self._translation, rotation = (factors[PARTS.index(part)] for part in ("translation", "rotation"))
-        self._rotation, self._leader, self._follower = np.pi / 2 * rotation, leader, follower
-        self._pairs, knows_roll = pairs, leader.knows_roll and follower.knows_roll
-        self._axis_weights = _ROTATION * (np.full(3, 0.5) if knows_roll else np.eye(3)[2])
-        self._hand_rows = slice(follower.links, follower.links + follower.hands)
-        self.knows_roll = knows_roll
+        translation, rotation = (factors[PARTS.index(part)] for part in ("translation", "rotation"))
+        self._translation, self._rotation = _POSTURE * translation, _POSTURE * np.pi / 2 * rotation.T
+        self._leader, self._follower, links, hands = leader, follower, follower.links, follower.hands
+        self.knows_roll, self._matched = leader.knows_roll and follower.knows_roll, pairs[:, 1]
+        # Of the cosine of the rotation, r (1 - cos theta) = r/4 sum |e_k - t_k|^2 over the axes.
+        of_axes = _ROTATION * (np.full(3, 0.5) if self.knows_roll else np.eye(3)[2])
+        self._directed, self._axes = slice(hands, hands + links), hands + links + 3 * self._matched[:, None] + range(3)
+        self._stiffness, self._rows = np.zeros(4 * hands + links), np.zeros((4 * hands + links, 3))
+        self._stiffness[self._matched], self._stiffness[self._axes] = 1, of_axes
 
     def goal(
         self,
@@ -166,43 +167,47 @@ class LivePose:
           axes: of the hands, one a row.
           to_base: rotation or reflection from the leader's base frame to the follower's.
         """
-        moving, links, leader = rows.moving[0] @ to_base.T, self._leader.links, self._leader
-        pulls = self._rotation.T @ moving[links + leader.hands : 2 * links + leader.hands]
-        strengths = np.sqrt((pulls * pulls).sum(axis=-1))
-        units = pulls / np.maximum(strengths, 1e-12)[:, None]
-        return Goal(position, axes, units, strengths, moving[:links])
+        links, hands = self._leader.links, self._leader.hands
+        moving, targets, stiffness = rows.moving[0] @ to_base.T, self._rows.copy(), self._stiffness.copy()
+        pulls = self._rotation @ moving[links + hands : 2 * links + hands]
+        strengths = np.sqrt(np.einsum("ij,ij->i", pulls, pulls))
+        targets[self._directed], stiffness[self._directed] = pulls / (strengths[:, None] + 1e-30), strengths
+        targets[self._matched], targets[self._axes] = position, axes
+        return Goal(moving[:links], targets, stiffness)
 
-    def pulls(self, goal: Goal, rows: Rows, longest: float = FAR) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Forces [lanes, rows, 3] and stiffnesses [lanes, rows] of the pulls, and their cost [lanes].
+    def pulls(self, goal: Goal, rows: Rows, longest: float = FAR, left: float = FAR) -> tuple[np.ndarray, ...]:
+        """Forces [lanes, rows, 3], stiffnesses [lanes, rows], damping [lanes] and cost [lanes] of the pulls.
 
         Args:
           goal: of the pulls.
           rows: of the follower.
           longest: pull on a hand [chain lengths].
+          left: pull that the last goal left, which damps this step [chain lengths].
         """
-        links, hands, moving = self._follower.links, self._pairs[:, 1], rows.moving
-        force, stiffness = np.zeros(moving.shape), np.zeros(moving.shape[:2])
-        # Links: weights w (|d| smoothed) of distances, and c (1 - e . t) = c |e - t|^2 / 2 of directions.
+        links, moving, hands = self._follower.links, rows.moving, self._follower.hands
+        force, stiffness = np.empty(moving.shape), np.empty(moving.shape[:2])
+        # Weights w of the distances of links, as w / |d| |d|^2.
         apart = moving[:, None, :links] - goal.points[:, None]
-        distance = np.sqrt((apart * apart).sum(axis=-1) + _SMOOTHING**2)
-        tension = _POSTURE * self._translation / distance
-        force[:, :links], stiffness[:, :links] = (tension[..., None] * apart).sum(axis=1), tension.sum(axis=1)
-        cost = (tension * distance * distance).sum(axis=(1, 2))
-        directed = slice(links + self._follower.hands, 2 * links + self._follower.hands)
-        apart, pull = moving[:, directed] - goal.units, _POSTURE * goal.strengths
-        force[:, directed], stiffness[:, directed] = pull[:, None] * apart, pull
-        cost += (pull * (apart * apart).sum(axis=-1)).sum(axis=-1) / 2
-        position, axes = self._follower.hand(rows)
-        apart, turned = position[:, hands] - goal.position, axes[:, hands] - goal.axes
-        cost += (apart * apart).sum(axis=(1, 2)) / 2 + ((turned * turned).sum(axis=-1) @ self._axis_weights).sum(1) / 2
-        length = np.sqrt((apart * apart).sum(axis=-1, keepdims=True))
-        at, first = links + hands, 2 * links + self._follower.hands
-        force[:, at], stiffness[:, at] = apart * np.minimum(1, longest / np.maximum(length, 1e-12)), 1
-        rows_of_axes = (first + 3 * hands[:, None] + np.arange(3)).ravel()
-        weights = np.tile(self._axis_weights, len(hands))
-        force[:, rows_of_axes] = weights[:, None] * turned.reshape(len(moving), -1, 3)
-        stiffness[:, rows_of_axes] = weights
-        return force, stiffness, cost
+        distance = np.sqrt(np.einsum("lijk,lijk->lij", apart, apart) + _SMOOTHING**2)
+        tension = self._translation / distance
+        force[:, :links], stiffness[:, :links] = np.einsum("lij,lijk->ljk", tension, apart), tension.sum(axis=1)
+        difference = moving[:, links:] - goal.rows
+        force[:, links:], stiffness[:, links:] = goal.stiffness[:, None] * difference, goal.stiffness
+        squares = np.einsum("lik,lik->li", difference, difference)
+        cost = np.einsum("ij,lij->l", self._translation, distance) + squares @ goal.stiffness / 2
+        length = np.sqrt(squares[:, :hands]) + 1e-30
+        pull = np.minimum(length, longest)
+        force[:, links : links + hands] *= (pull / length)[..., None]
+        return force, stiffness, _DAMPING + _LEVER * np.minimum(pull @ goal.stiffness[:hands], left), cost
+
+    def errors(self, goal: Goal, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
+        """Maximum distance [m] and angle [rad] of the hands, [lanes] each."""
+        difference = rows.moving[:, self._follower.links :] - goal.rows
+        squares = np.einsum("lik,lik->li", difference, difference)
+        apart = self._follower.unit * np.sqrt(squares[:, self._matched].max(axis=1))
+        chord = squares[:, self._axes]  # of one axis 4 sin^2 of half the angle, of all three twice as much
+        chord = chord.sum(axis=-1) / 8 if self.knows_roll else chord[..., 2] / 4
+        return apart, 2 * np.arcsin(np.sqrt(np.minimum(chord.max(axis=1), 1)))
 
     def step(
         self,
@@ -211,12 +216,20 @@ class LivePose:
         lower: Float[np.ndarray, "lanes joints"],
         upper: Float[np.ndarray, "lanes joints"],
         longest: float = NEAR,
+        left: float = FAR,
+        rows: Rows | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Joint angles within the box [lower, upper] after a step, and the cost [lanes] before it."""
-        rows = self._follower(qpos)
-        force, stiffness, cost = self.pulls(goal, rows, longest)
-        hands = force[:, self._hand_rows]
-        damping = _DAMPING + _LEVER * np.sqrt((hands * hands).sum(axis=(1, 2)))
+        """Joint angles within the box [lower, upper] after a step, and the cost [lanes] before it.
+
+        Args:
+          goal: of the step.
+          qpos: before the step [rad].
+          lower, upper: of the box [rad].
+          longest, left: see `pulls`.
+          rows: at these angles, where they are known.
+        """
+        rows = self._follower(qpos) if rows is None else rows
+        force, stiffness, damping, cost = self.pulls(goal, rows, longest, left)
         columns = self._follower.jacobian(rows)
         flat = columns.reshape(*columns.shape[:2], -1)
         gradient = (flat @ np.swapaxes(force, 1, 2).reshape(len(qpos), -1, 1))[..., 0]
@@ -230,17 +243,17 @@ def _step_in_box(
     """The minimum of a damped quadratic function in a box, where joints that reach an edge stay there."""
     joints = np.arange(hessian.shape[-1])
     hessian[:, joints, joints] += damping[:, None]
-    free, step = np.ones(gradient.shape, bool), np.zeros_like(gradient)
+    step = np.linalg.solve(hessian, -gradient[..., None])[..., 0]
+    free = np.ones(gradient.shape, bool)
     for _ in range(_PASSES):
-        matrix = np.where(free[:, :, None] & free[:, None], hessian, 0)
-        matrix[:, joints, joints] += ~free
-        fixed = np.where(free, 0, step)
-        right = np.where(free, -gradient - (hessian @ fixed[..., None])[..., 0], fixed)
-        step = np.linalg.solve(matrix, right[..., None])[..., 0]
-        inside = np.clip(step, lower, upper)
+        inside = np.minimum(np.maximum(step, lower), upper)
         held = (inside != step) & free
-        step = inside
         if not held.any():
             break
         free &= ~held
-    return step
+        fixed = np.where(free, 0, inside)
+        matrix = np.where(free[:, :, None] & free[:, None], hessian, 0)
+        matrix[:, joints, joints] += ~free
+        right = np.where(free, -gradient - (hessian @ fixed[..., None])[..., 0], fixed)
+        step = np.linalg.solve(matrix, right[..., None])[..., 0]
+    return np.minimum(np.maximum(step, lower), upper)

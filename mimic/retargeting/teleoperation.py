@@ -18,17 +18,19 @@ from mimic.base.distribution import install_command
 from mimic.control.limits import JointLimits, joint_limits
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.hand_target import matched_hands, placement
-from mimic.retargeting.live_pose import FAR, ArmRows, Goal, LivePose
+from mimic.retargeting.live_pose import FAR, NEAR, ArmRows, Goal, LivePose, Rows
 from mimic.retargeting.pose import wrap_angles
 
 HANDS = ("exact", "relative")
 STATES = ("tracking", "nearest", "catching up", "approaching", "holding", "waiting", "disengaged")
 _TOLERANCE = 1e-3, np.radians(0.5)  # m, rad: hands that are nearer count as reached
-_STEPS = 2  # of the posture in a tick
 _MAX_SPEED = 4 * np.pi  # rad/s of a leader; a sample that moved faster is a jump
 _PATIENCE = 0.12  # s after which samples that agree with each other count, though they jumped or time ran backwards
 _TIMEOUT = 0.2  # s without a sample, after which the follower is said to hold
+_FREE, _SPEED_TIME = 0.8, 0.03  # of the velocity limits: below, the path's speed counts, smoothed over this time [s]
 _APPROACH = 0.5  # of the velocity limits, on the way to another posture
+_AHEAD = 0.05  # s, the shortest of the trajectories of which a tick takes the beginning
+_BRAKING = 0.5  # of twice the acceleration: what a joint needs to stop before its limit
 _GRIPPER_TIME = 0.25  # s at least from closed to open
 _LANES, _ROUNDS = 12, 25  # postures of a search for another branch, and ticks that it takes
 _STUCK = 0.3  # s with a hand that is not reached, after which another branch is searched
@@ -119,6 +121,7 @@ class Teleoperator:
         self._samples = _Samples(leader, self._period)
         self._gripper = _Gripper(*grippers, self._period)
         self._limiter = _Limiter(self.limits, self._period)
+        self._smoothing = 1 - np.exp(-self._period / _SPEED_TIME)
         self._random = np.random.default_rng(0)
         self._lower, self._upper = self.limits.position.T
         self.reset(np.clip(follower.home, self._lower, self._upper))
@@ -141,6 +144,8 @@ class Teleoperator:
         """Lets the next sample lead: with "relative" from here, with "exact" by an approach of limited speed."""
         self.is_engaged, self._anchor, self._goal = True, None, None
         self._posture = self._path = self._limiter.qpos
+        self._speed, self._posture_rows, self._is_reached = np.zeros_like(self._path), None, True
+        self._left = FAR
         self._is_near, self._stuck, self._lanes, self._rounds = self._is_relative, 0.0, None, 0
 
     def disengage(self) -> None:
@@ -175,10 +180,12 @@ class Teleoperator:
             self._goal = self._goal_of(sample)
         if self._goal is None:
             status = TeleoperationStatus("waiting", self._samples.reason or "no sample yet", np.nan, np.nan)
-            return FollowerCommand(self._limiter.step(self._path), opening, status)
+            return FollowerCommand(self._limiter.step(self._path, self._speed), opening, status)
         self._advance(self._goal)
-        qpos = self._limiter.step(self._path)
-        return FollowerCommand(qpos, opening, self._status(self._goal, qpos))
+        qpos = self._limiter.step(self._path, self._speed)
+        rows = self._rows[1](np.stack([self._posture, qpos]))
+        self._posture_rows = Rows(*(x[:1] for x in rows))
+        return FollowerCommand(qpos, opening, self._status(*self._pose.errors(self._goal, rows)))
 
     def _goal_of(self, sample: np.ndarray) -> Goal:
         """The goal of a sample of the leader."""
@@ -202,10 +209,11 @@ class Teleoperator:
         """Moves the posture towards the goal, and the path towards the posture."""
         reach = self.limits.velocity * self._period
         lower, upper = np.maximum(self._lower, self._posture - reach), np.minimum(self._upper, self._posture + reach)
-        posture = self._posture[None]
-        for _ in range(_STEPS):
-            posture, _ = self._pose.step(goal, posture, lower, upper)
-        self._posture = posture[0]
+        posture, _ = self._pose.step(goal, self._posture[None], lower, upper, NEAR, self._left, self._posture_rows)
+        moved, self._posture = posture[0] - self._posture, posture[0]
+        # A path that goes as fast as it may ends at once, where the command must be able to stop.
+        is_free = self._is_near and bool(np.all(np.abs(moved) < _FREE * reach))
+        self._speed = self._speed + self._smoothing * (moved / self._period - self._speed) if is_free else 0 * moved
         self._search(goal)
         away = self._posture - self._path
         fraction = np.max(np.abs(away) / (reach * (1.0 if self._is_near else _APPROACH)))
@@ -215,9 +223,8 @@ class Teleoperator:
     def _search(self, goal: Goal) -> None:
         """Searches other branches at the start of an approach, and while the hand is not reached, a step in a tick."""
         if self._lanes is None:
-            error = self._errors(goal, self._posture)
-            is_reached = error[0] <= _TOLERANCE[0] and error[1] <= _TOLERANCE[1]
-            self._stuck = 0.0 if is_reached or not self._is_near else self._stuck + self._period
+            is_well = self._is_reached or not self._is_near
+            self._stuck = 0.0 if is_well else self._stuck + self._period
             if self._is_near and self._stuck < _STUCK:
                 return
             if not self._is_near and self._rounds:
@@ -232,35 +239,28 @@ class Teleoperator:
             return
         best, self._lanes, self._stuck = self._lanes[cost.argmin()], None, 0.0
         if not self._is_near or self._leads_there(goal, best, float(cost.min())):
-            self._posture, self._is_near = best, False
+            self._posture, self._posture_rows, self._is_near = best, None, False
 
     def _leads_there(self, goal: Goal, posture: np.ndarray, cost: float) -> bool:
         """Whether another branch is better, and the hand does not go away from its goal on the straight way there."""
         line = self._posture + np.linspace(0, 1, _LINE)[:, None] * (posture - self._posture)
-        costs = self._pose.pulls(goal, self._rows[1](line))[2]
+        costs = self._pose.pulls(goal, self._rows[1](line))[3]
         return cost < 0.5 * costs[0] and costs.max() <= _DETOUR * costs[0]
 
-    def _errors(self, goal: Goal, qpos: np.ndarray) -> tuple[float, float]:
-        """Maximum distance [m] and angle [rad] of the hands."""
-        position, axes = (x[0, self._pairs[:, 1]] for x in self._rows[1].hand(self._rows[1](qpos[None])))
-        apart = np.sqrt(((position - goal.position) ** 2).sum(axis=-1).max()) * self._rows[1].unit
-        cosine = (axes * goal.axes).sum(axis=-1)
-        chord = (3 - cosine.sum(axis=-1)) / 4 if self._pose.knows_roll else (1 - cosine[:, 2]) / 2
-        return float(apart), float(2 * np.arcsin(np.sqrt(np.clip(chord, 0, 1)).max()))
-
-    def _status(self, goal: Goal, qpos: np.ndarray) -> TeleoperationStatus:
-        """What the follower does, and why."""
-        position, rotation = self._errors(goal, qpos)
-        errors, reason = (1e3 * position, float(np.degrees(rotation))), self._samples.reason
+    def _status(self, positions: np.ndarray, rotations: np.ndarray) -> TeleoperationStatus:
+        """What the follower does, and why, from errors [m, rad] of the hands of the posture and of the command."""
+        reached = (positions <= _TOLERANCE[0]) & (rotations <= _TOLERANCE[1])
+        self._is_reached, self._left = bool(reached[0]), positions[0] / self._rows[1].unit
+        errors, reason = (1e3 * float(positions[1]), float(np.degrees(rotations[1]))), self._samples.reason
         if self._samples.age > _TIMEOUT:
             return TeleoperationStatus("holding", reason or f"no sample for {self._samples.age:.1f} s", *errors)
         if not self._is_near:
             return TeleoperationStatus("approaching", "on the way to a posture with this hand", *errors)
-        if position <= _TOLERANCE[0] and rotation <= _TOLERANCE[1]:
+        if reached[1]:
             return TeleoperationStatus("tracking", reason, *errors)
-        position, rotation = self._errors(goal, self._posture)
-        if position <= _TOLERANCE[0] and rotation <= _TOLERANCE[1]:
+        if reached[0]:
             return TeleoperationStatus("catching up", reason or "the leader is faster than the limits", *errors)
+        position, rotation = positions[0], rotations[0]
         at_limit = (self._posture - self._lower < 1e-3) | (self._upper - self._posture < 1e-3)
         names = ", ".join(np.array(self.follower.joint_names)[at_limit])
         why = f"{names} at the limit" if names else "out of reach" if position > _TOLERANCE[0] else "rotation not free"
@@ -362,7 +362,7 @@ class _Gripper:
 
 
 class _Limiter:
-    """Ruckig's online trajectories to rest at a goal, each joint for itself, or to rest as soon as possible."""
+    """Ruckig's online trajectories through a goal, or to rest as soon as possible."""
 
     def __init__(self, limits: JointLimits, period: float):
         try:
@@ -372,11 +372,10 @@ class _Limiter:
         joints = len(limits.velocity)
         self._ruckig, self._input = ruckig.Ruckig(joints, period), ruckig.InputParameter(joints)
         self._output, self._interfaces = ruckig.OutputParameter(joints), ruckig.ControlInterface
-        # Joints that wait for each other may brake later than they can, and pass a position limit.
-        self._input.synchronization = ruckig.Synchronization.No
+        self._input.minimum_duration = _AHEAD  # as fast as possible, a trajectory of each tick has all the acceleration
         self._input.max_velocity, self._input.max_acceleration = limits.velocity.tolist(), limits.acceleration.tolist()
         self._input.max_jerk = limits.jerk.tolist()
-        self._zero = [0.0] * joints
+        self._zero, self._limits = [0.0] * joints, limits
 
     @property
     def qpos(self) -> np.ndarray:
@@ -388,14 +387,18 @@ class _Limiter:
         self._input.current_position = self._input.target_position = qpos.tolist()
         self._input.current_velocity = self._input.current_acceleration = self._zero
 
-    def step(self, goal: np.ndarray) -> np.ndarray:
-        """Angles after a tick on the way to a goal [rad]."""
-        self._input.control_interface, self._input.target_position = self._interfaces.Position, goal.tolist()
+    def step(self, goal: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """Angles after a tick on the way through a goal [rad] at a speed [rad/s], from which joints can still stop."""
+        lower, upper = self._limits.position.T
+        ahead = np.minimum(np.maximum(goal + _AHEAD * speed, lower), upper)
+        down, up = (np.sqrt(_BRAKING * self._limits.acceleration * x) for x in (ahead - lower, upper - ahead))
+        self._input.control_interface, self._input.target_position = self._interfaces.Position, ahead.tolist()
+        self._input.target_velocity = np.minimum(np.maximum(speed, -down), up).tolist()
         return self._next()
 
     def brake(self) -> np.ndarray:
         """Angles after a tick of braking [rad]."""
-        self._input.control_interface = self._interfaces.Velocity
+        self._input.control_interface, self._input.target_velocity = self._interfaces.Velocity, self._zero
         return self._next()
 
     def _next(self) -> np.ndarray:

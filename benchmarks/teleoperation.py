@@ -1,0 +1,366 @@
+"""Live teleoperation: followers of another build within their limits, whatever the leader sends.
+
+    python -m benchmarks.teleoperation --data FOLDER --robots FOLDER [--parts episodes sweeps times] [--out FILE]
+
+FOLDER of `--data` has arms/ and teleop/so101_to_piper, that of `--robots` the arms of robosuite; `--clip` is a captured
+person. Episodes: the recorded leader (SO-101) drives a Piper, at the recorded rate and resampled to 100 Hz. The
+`recorded` follower is what the recording's own mapping did. `bound`: fraction of the frames with an embodiment distance
+within 5 % of that of `imitate_pose`, which has no limits of speed. Sweeps: a leader wanders through all of its joint
+ranges, while 30 % of the samples are lost, stall for 2 s, jump, are not finite, or have times that run backwards.
+Limits are checked by differences of the commands; `recovery` is the time from the first good sample after a fault to
+the first command that follows samples again. Times: of one step, beside a fixed loop of NumPy on the same core, ssik's
+Tracker and mink.
+"""
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import mimic
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import Row, print_table, write_results
+from benchmarks.exact_hands import SPEEDS, as_numbers, hand_matrices, homogeneous, joint_motions
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.embodiment import Embodiment, load_mjcf
+from mimic.metric.config import MetricConfig
+from mimic.motions.importing import read_source, source_names
+from mimic.motions.units import in_rad
+from mimic.retargeting.hand_target import placement
+
+EPISODES = (
+    "method rate frames position_mm_p95:.2f hand_direction_deg:.2f bound:.1% of_limits:.3f stalled_s:.2f elbow:.3f "
+    "plane_deg:.1f"
+)
+SWEEPS = "pair steps not_finite beyond_mrad:.6f of_limits:.4f recovery_s:.2f holding:.1%"
+TIMES = "method p50_ms:.3f p99_ms:.3f p999_ms:.3f core_us_p50:.1f core_us_p99:.1f"
+# rad/s (data sheets); Piper's model states 0 for its first joint, those of robosuite nothing.
+SPEED = {
+    "piper": [3.14, 3.40, 3.14, 3.92, 3.92, 3.92],
+    "panda": [2.175] * 4 + [2.61] * 3,
+    "so101": [4.7] * 5,
+    "ur5e": SPEEDS["ur5e"],
+}
+BASE = [-0.21, 0.0, 0.0, 0.0]  # of the Piper in the SO-101's base frame, from `find_base` and then rounded
+PAIRS = ("panda-ur5e", "ur5e-panda", "so101-panda", "panda-so101", "person-panda")
+FAULTS = ("lost", "stalled", "jumped", "displaced", "not finite", "backwards")
+_RATE, _LOST = 100.0, 0.3  # Hz; fraction of samples that are lost
+
+
+def arm(name: str, options: argparse.Namespace) -> Embodiment:
+    files = {
+        "so101": options.data / "arms/so101/so101_new_calib.urdf",
+        "piper": options.data / "arms/piper.urdf",
+        "ur5e": options.robots / "ur5e/robot.xml",
+    }
+    if name == "panda":
+        return mimic.panda(limits="hardware")
+    return build_arm(ArmConfig(model=str(files[name])), "hardware").embodiment
+
+
+def person(clip: Path) -> tuple[Embodiment, np.ndarray]:
+    """The right arm of a captured person, and its poses at 100 Hz."""
+    from mimic.commands.capture import read_arm
+    from mimic.commands.config import CaptureConfig
+    from mimic.motions.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
+
+    part = max(read_arm(clip, "right", CaptureConfig()).parts, key=lambda part: len(part.start))
+    zero = zero_frames(part)
+    with tempfile.TemporaryDirectory() as folder:
+        (path := Path(folder) / "person.xml").write_text(ball_chain_xml(part, zero))
+        leader = load_mjcf(str(path))
+    qpos = np.unwrap(ball_chain_motion(part, zero)[0], axis=0)
+    return leader, resampled(qpos, part.rate)
+
+
+def resampled(qpos: np.ndarray, rate: float) -> np.ndarray:
+    times = np.arange(0, (len(qpos) - 1) / rate, 1 / _RATE) * rate
+    return np.stack([np.interp(times, np.arange(len(qpos)), column) for column in qpos.T], axis=1)
+
+
+def ratios(path: np.ndarray, operator: mimic.Teleoperator, rate: float) -> tuple[float, float, int]:
+    """Largest speed, acceleration or jerk over its limit, how far beyond the ranges [mrad], number of violations."""
+    limits, largest, count, differences = operator.limits, 0.0, 0, path
+    for limit in (limits.velocity, limits.acceleration, limits.jerk):
+        differences = np.diff(differences, axis=0) * rate
+        fraction = np.abs(differences) / limit
+        largest, count = max(largest, fraction.max()), count + int((fraction > 1 + 1e-6).sum())
+    lower, upper = limits.position.T
+    beyond = np.maximum(lower - path, path - upper).max()
+    return float(largest), 1e3 * float(beyond), count
+
+
+def landmarks(embodiment: Embodiment, qpos: np.ndarray) -> np.ndarray:
+    """Anchors [3, time, 3] of shoulder, elbow and wrist in chain lengths, in the base frame."""
+    chosen = {5: (1, 2, 3), 6: (1, 2, 4), 7: (1, 3, 5)}[embodiment.num_joints]
+    motions = list(joint_motions(embodiment, qpos))
+    points = [motions[i - 1] @ np.append(embodiment.joint_anchor[i], 1) for i in chosen]
+    return np.stack(points)[..., :3] / float(embodiment.chain_length)
+
+
+def resemblance(leader: Embodiment, follower: Embodiment, base: Any, qpos: np.ndarray, own: np.ndarray) -> Row:
+    """Mean distance of the elbows [chain lengths], and angle of the planes of shoulder, elbow and wrist."""
+    points = landmarks(leader, qpos), landmarks(follower, own) @ placement(base).rotation.T
+    points = [x - x[:1] for x in points]
+    normals = [np.cross(x[1], x[2]) for x in points]
+    normals = [x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-9) for x in normals]
+    cosine = np.minimum(np.abs(np.sum(normals[0] * normals[1], axis=-1)), 1)  # a plane has two normals
+    elbow = np.linalg.norm(points[0][1] - points[1][1], axis=-1).mean()
+    return {"elbow": elbow, "plane_deg": np.degrees(np.arccos(cosine)).mean()}
+
+
+def driven(operator: mimic.Teleoperator, leader_qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Commands, seconds of each step, and states; engaged on the first pose until its hand is reached or nearest."""
+    operator.engage()
+    for _ in range(1000):
+        if operator.step(leader_qpos[0]).status.state in ("tracking", "nearest"):
+            break
+    path, seconds, states = [], [], []
+    for sample in leader_qpos:
+        began = time.perf_counter()
+        command = operator.step(sample)
+        seconds.append(time.perf_counter() - began)
+        path.append(command.qpos)
+        states.append(command.status.state)
+    return np.array(path), np.array(seconds), states
+
+
+def recordings(embodiment: Embodiment, unit: str, options: argparse.Namespace) -> list[np.ndarray]:
+    """Recorded angles of each episode [rad]; the leader's go beyond its model's ranges."""
+    source = read_source(options.data / "teleop/so101_to_piper", source_names(embodiment, ()), "", None)
+    angles = in_rad(source, unit, np.asarray(embodiment.joint_range))
+    return [motion.qpos for motion in angles.motions.values()][: options.episodes]
+
+
+def episodes(options: argparse.Namespace) -> Iterator[Row]:
+    leader, follower = arm("so101", options), arm("piper", options)
+    paths, recorded = recordings(leader, "deg", options), recordings(follower, "percent", options)
+    metric = MetricConfig().build(leader, follower)
+    nearest = jax.jit(
+        lambda qpos: mimic.imitate_pose(leader, follower, qpos, **metric.arguments, hand="exact", base=BASE)
+    )
+    distance = jax.jit(jax.vmap(lambda q, own: metric(*states(leader, follower, BASE, q, own))))
+    for rate in (15.0, _RATE):
+        paths = paths if rate != _RATE else [resampled(path, 15.0) for path in paths]
+        qpos = np.concatenate(paths)
+        operator = mimic.Teleoperator(leader, follower, base=BASE, rate=rate, velocity=SPEED["piper"])
+        runs = [driven(operator, path)[0] for path in paths]
+        bound = np.concatenate([np.asarray(nearest(chunk).distance) for chunk in chunks(qpos)])[: len(qpos)]
+        ways = {"mimic": np.concatenate(runs)}
+        if rate != _RATE:
+            ways["recorded"] = np.concatenate(recorded)
+        of_limits = [ratios(run, operator, rate) for run in runs]
+        for method, own in ways.items():
+            mine, base = method == "mimic", BASE if method == "mimic" else None
+            apart = [np.asarray(distance(*part)) for part in zip(chunks(qpos), chunks(own), strict=True)]
+            within = np.concatenate(apart)[: len(qpos)] <= 1.05 * bound + 1e-6
+            row = {"method": method, "rate": rate, "frames": len(qpos)}
+            row |= hand_errors(leader, follower, base, qpos, own) | resemblance(leader, follower, base, qpos, own)
+            if mine:
+                row |= {"bound": within.mean(), "violations": sum(x[2] for x in of_limits)}
+                row |= {"of_limits": max(x[0] for x in of_limits), "stalled_s": stalled(runs, paths, rate)}
+            yield as_numbers(row)
+
+
+def states(leader: Embodiment, follower: Embodiment, base: Any, qpos: Any, own: Any) -> tuple[Any, Any]:
+    """Link states of both arms in the axes of the follower's base."""
+    rotation = placement(base).rotation.T
+    turned = jax.tree.map(lambda x: x @ rotation.T, mimic.link_states(leader, qpos))
+    return turned, mimic.link_states(follower, own)
+
+
+def chunks(rows: np.ndarray, size: int = 2048) -> list[np.ndarray]:
+    rows = np.concatenate([rows, np.repeat(rows[-1:], -len(rows) % size, axis=0)]).astype(np.float32)
+    return list(rows.reshape(-1, size, rows.shape[1]))
+
+
+def hand_errors(leader: Embodiment, follower: Embodiment, base: Any, qpos: np.ndarray, own: np.ndarray) -> Row:
+    """Distance of the hands, and the mean angle of their approaches."""
+    targets = np.linalg.inv(homogeneous(*placement(base))) @ hand_matrices(leader, qpos)
+    hands = hand_matrices(follower, own)
+    apart = 1e3 * np.linalg.norm(hands[:, :3, 3] - targets[:, :3, 3], axis=1)
+    cosine = np.clip(np.sum(hands[:, :3, 2] * targets[:, :3, 2], axis=1), -1, 1)
+    return {
+        "position_mm_p50": np.median(apart),
+        "position_mm_p95": np.percentile(apart, 95),
+        "hand_direction_deg": np.degrees(np.arccos(cosine)).mean(),
+    }
+
+
+def stalled(runs: list[np.ndarray], paths: list[np.ndarray], rate: float) -> float:
+    """The longest time in which the leader moves all the while and the follower does not [s]."""
+    longest = 0
+    for run, path in zip(runs, paths, strict=True):
+        moves, stands = (np.abs(np.diff(x, axis=0)).max(axis=1) * rate for x in (path, run))
+        count = 0
+        for stalls in (moves > 0.1) & (stands < 1e-3):
+            count = count + 1 if stalls else 0
+            longest = max(longest, count)
+    return longest / rate
+
+
+def wander(leader: Embodiment, steps: int, rng: np.random.Generator) -> np.ndarray:
+    """A smooth motion through all of the joint ranges, with the speed of a person's hand."""
+    lower, upper = leader.joint_range.T
+    lower, upper = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
+    times, waves = np.arange(steps)[:, None] / _RATE, 0.0
+    for _ in range(3):
+        frequency, phase = rng.uniform(0.03, 0.25, leader.num_joints), rng.uniform(0, 2 * np.pi, leader.num_joints)
+        waves = waves + np.sin(2 * np.pi * frequency * times + phase)
+    return (lower + upper) / 2 + (upper - lower) / 2 * np.clip(waves / 2, -1, 1)
+
+
+def sweep(name: str, options: argparse.Namespace, block: int = 20000) -> Row:
+    """A leader with faults, and what its follower did."""
+    one, other = name.split("-")
+    follower, rng = arm(other, options), np.random.default_rng(PAIRS.index(name))
+    leader, clip = person(options.clip) if one == "person" else (arm(one, options), None)
+    scale = float(follower.chain_length / leader.chain_length)
+    operator = mimic.Teleoperator(leader, follower, scale=scale, velocity=SPEED[other], rate=_RATE)
+    row: Row = {"pair": name, "steps": 0, "not_finite": 0, "violations": 0, "of_limits": 0.0, "beyond_mrad": -np.inf}
+    recoveries, holding, begin = [], 0, None
+    operator.engage()
+    while row["steps"] < options.steps:
+        motion = wander(leader, block, rng) if clip is None else clip[np.arange(block) % (2 * len(clip)) - len(clip)]
+        path, of_block, held = faulty(operator, motion, rng)
+        before = path if begin is None else np.concatenate([begin, path])  # across blocks too
+        largest, beyond, count = ratios(before, operator, _RATE)
+        begin, recoveries, holding = path[-3:], recoveries + of_block, holding + held
+        row |= {"steps": row["steps"] + block, "not_finite": row["not_finite"] + int((~np.isfinite(path)).sum())}
+        row |= {"violations": row["violations"] + count, "of_limits": max(row["of_limits"], largest)}
+        row["beyond_mrad"] = max(row["beyond_mrad"], beyond)
+    recovery = {"recoveries": len(recoveries), "recovery_s": max(recoveries), "holding": holding / row["steps"]}
+    return as_numbers(row | recovery)
+
+
+def faulty(
+    operator: mimic.Teleoperator, motion: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, list[float], int]:
+    """Commands of a motion with a fault of a random kind each 4 s, times of recovery [s], and ticks of holding."""
+    path, recoveries, holding, clock, waiting = [], [], 0, 0.0, None
+    for tick, sample in enumerate(motion):
+        phase, kind = tick % 400, FAULTS[(tick // 400) % len(FAULTS)]
+        has_fault = phase < (200 if kind == "stalled" else 40)
+        sent: Any = None if rng.random() < _LOST else sample
+        clock += 1 / _RATE
+        stamp = clock
+        if has_fault and sent is not None:
+            if kind in ("lost", "stalled"):
+                sent = None
+            elif kind == "jumped":
+                sent = sample + rng.uniform(-2, 2, len(sample))
+            elif kind == "displaced":  # a jump to where the leader then is
+                sent = sample + 0.5
+            elif kind == "not finite":
+                sent = np.where(rng.random(len(sample)) < 0.5, rng.choice([np.nan, np.inf]), sample)
+            else:
+                stamp = clock - rng.uniform(0, 100)
+        command = operator.step(sent, time=stamp)
+        path.append(command.qpos)
+        holding += command.status.state == "holding"
+        if has_fault:
+            waiting = -1
+        elif waiting is not None:
+            waiting = tick if waiting == -1 and sent is not None else waiting
+            follows = command.status.state != "holding" and "ignored" not in command.status.reason and sent is not None
+            if waiting >= 0 and follows:
+                recoveries.append((tick - waiting) / _RATE)
+                waiting = None
+    return np.array(path), recoveries, holding
+
+
+def core_seconds(count: int = 2000) -> np.ndarray:
+    """Seconds of a fixed loop of NumPy: 20 products of small matrices."""
+    matrix, seconds = np.eye(7) + 0.01, []
+    for _ in range(count):
+        began = time.perf_counter()
+        for _ in range(20):
+            matrix @ matrix
+        seconds.append(time.perf_counter() - began)
+    return np.array(seconds)
+
+
+def times(options: argparse.Namespace) -> Iterator[Row]:
+    leader, follower = arm("so101", options), arm("piper", options)
+    qpos = np.concatenate([resampled(path, 15.0) for path in recordings(leader, "deg", options)[:8]])
+    targets = np.linalg.inv(homogeneous(*placement(BASE))) @ hand_matrices(leader, qpos)
+    operator = mimic.Teleoperator(leader, follower, base=BASE, velocity=SPEED["piper"], rate=_RATE)
+    methods: dict[str, Callable[[], tuple[np.ndarray, np.ndarray]]] = {
+        "mimic": lambda: driven(operator, qpos)[:2],
+        "ssik's Tracker": lambda: tracked_by_ssik(follower, targets, operator.step(None).qpos),
+        "mink": lambda: tracked_by_mink(follower, targets, operator.step(None).qpos),
+    }
+    for method, run in methods.items():
+        core = 1e6 * core_seconds()
+        own, seconds = run()
+        row = {"method": method, "steps": len(own), **hand_errors(leader, follower, BASE, qpos, own)}
+        row |= dict(zip(("p50_ms", "p99_ms", "p999_ms"), 1e3 * np.percentile(seconds, [50, 99, 99.9]), strict=True))
+        row |= {"core_us_p50": np.median(core), "core_us_p99": np.percentile(core, 99)}
+        row |= {"of_limits": ratios(own, operator, _RATE)[0], **resemblance(leader, follower, BASE, qpos, own)}
+        yield as_numbers(row)
+
+
+def tracked_by_ssik(follower: Embodiment, targets: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    import ssik
+
+    points = np.concatenate([np.zeros((1, 3)), follower.joint_anchor, follower.hand_position])
+    manipulator = ssik.Manipulator.from_axes(follower.joint_axis, np.diff(points, axis=0), limits=follower.joint_range)
+    back = homogeneous(follower.hand_rotation[0].T, np.zeros(3))
+    tracker, path, seconds = ssik.Tracker(manipulator, start, max_joint_speed=SPEED["piper"]), [], []
+    for tick, target in enumerate(targets):
+        began = time.perf_counter()
+        step = tracker.update(target @ back, tick / _RATE)
+        seconds.append(time.perf_counter() - began)
+        path.append(np.asarray(step.q, float))
+    return np.array(path), np.array(seconds)
+
+
+def tracked_by_mink(follower: Embodiment, targets: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One step of mink's inverse kinematics for each target, within the limits of position and velocity."""
+    import mink
+
+    from benchmarks.exact_hands import mink_model
+
+    model = mink_model(follower)
+    configuration = mink.Configuration(model, start)
+    speeds = dict(zip(follower.joint_names, SPEED["piper"], strict=True))
+    limits = [mink.ConfigurationLimit(model), mink.VelocityLimit(model, speeds)]
+    task, path, seconds = mink.FrameTask("hand", "site", 1.0, 1.0, lm_damping=1e-3), [], []
+    for target in targets:
+        began = time.perf_counter()
+        task.set_target(mink.SE3.from_matrix(target))
+        velocity = mink.solve_ik(configuration, [task], 1 / _RATE, solver="daqp", damping=1e-6, limits=limits)
+        configuration.integrate_inplace(velocity, 1 / _RATE)
+        seconds.append(time.perf_counter() - began)
+        path.append(configuration.q.copy())
+    return np.array(path), np.array(seconds)
+
+
+def main() -> None:
+    parser = make_parser(
+        "teleoperation", __doc__, parts=("episodes", "sweeps", "times"), pairs=PAIRS, steps=20000, episodes=55
+    )
+    for name in ("data", "robots", "clip"):
+        parser.add_argument(f"--{name}", type=Path)
+    options = parser.parse_args()
+    content: dict[str, list[Row]] = {"episodes": [], "sweeps": [], "times": []}
+    makers = {
+        "episodes": lambda: episodes(options),
+        "sweeps": lambda: (sweep(name, options) for name in options.pairs),
+        "times": lambda: times(options),
+    }
+    for part in options.parts:
+        for row in makers[part]():
+            content[part].append(row)
+            write_results(options, **content)
+    for part, columns in (("episodes", EPISODES), ("sweeps", SWEEPS), ("times", TIMES)):
+        print_table(content[part], columns, part)
+
+
+if __name__ == "__main__":
+    main()
