@@ -280,7 +280,7 @@ def core_seconds(count: int = 2000) -> np.ndarray:
     for _ in range(count):
         began = time.perf_counter()
         for _ in range(20):
-            matrix @ matrix
+            np.matmul(matrix, matrix)
         seconds.append(time.perf_counter() - began)
     return np.array(seconds)
 

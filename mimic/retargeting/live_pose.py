@@ -30,11 +30,14 @@ class Goal(NamedTuple):
       points: [leader_links, 3] positions of the leader's links, in its own chain lengths.
       rows: [rows, 3] of the follower's hand positions, link directions and hand axes.
       stiffness: [rows] of these pulls.
+      position, axes: [pairs, 3] and [pairs, 3, 3] of the matched hands; their axes are rows.
     """
 
     points: Float[np.ndarray, "leader_links 3"]
     rows: Float[np.ndarray, "rows 3"]
     stiffness: Float[np.ndarray, " rows"]
+    position: Float[np.ndarray, "pairs 3"]
+    axes: Float[np.ndarray, "pairs 3 3"]
 
 
 class Rows(NamedTuple):
@@ -148,7 +151,10 @@ class LivePose:
         self.knows_roll, self._matched = leader.knows_roll and follower.knows_roll, pairs[:, 1]
         # Of the cosine of the rotation, r (1 - cos theta) = r/4 sum |e_k - t_k|^2 over the axes.
         of_axes = _ROTATION * (np.full(3, 0.5) if self.knows_roll else np.eye(3)[2])
-        self._directed, self._axes = slice(hands, hands + links), hands + links + 3 * self._matched[:, None] + range(3)
+        self._directed, self._axes = (
+            slice(hands, hands + links),
+            hands + links + 3 * self._matched[:, None] + np.arange(3),
+        )
         self._stiffness, self._rows = np.zeros(4 * hands + links), np.zeros((4 * hands + links, 3))
         self._stiffness[self._matched], self._stiffness[self._axes] = 1, of_axes
 
@@ -173,7 +179,7 @@ class LivePose:
         strengths = np.sqrt(np.einsum("ij,ij->i", pulls, pulls))
         targets[self._directed], stiffness[self._directed] = pulls / (strengths[:, None] + 1e-30), strengths
         targets[self._matched], targets[self._axes] = position, axes
-        return Goal(moving[:links], targets, stiffness)
+        return Goal(moving[:links], targets, stiffness, position, axes)
 
     def pulls(self, goal: Goal, rows: Rows, longest: float = FAR, left: float = FAR) -> tuple[np.ndarray, ...]:
         """Forces [lanes, rows, 3], stiffnesses [lanes, rows], damping [lanes] and cost [lanes] of the pulls.
