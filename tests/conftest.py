@@ -127,6 +127,20 @@ def own_registry(monkeypatch: pytest.MonkeyPatch):
         sys.modules.pop(plugin, None)
 
 
+@pytest.fixture
+def in_time():
+    """Ends a reader that waits."""
+
+    def stop(*_):
+        raise TimeoutError("a reader waits")
+
+    previous = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(100)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, previous)
+
+
 @pytest.fixture(scope="session")
 def schemas():
     """`mimic.base.config.schema`, once for each class."""

@@ -2,7 +2,6 @@
 
 import ast
 import os
-import signal
 import socket
 
 import pytest
@@ -31,20 +30,6 @@ READERS = {
     "check": files.check_file,
 }
 KINDS_OF_FILES = {"pipe": "a named pipe", "socket": "a socket", "folder": "a folder", "/dev/zero": "a device"}
-
-
-@pytest.fixture
-def in_time():
-    """Ends a reader that waits."""
-
-    def stop(*_):
-        raise TimeoutError("a reader waits")
-
-    previous = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(60)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, previous)
 
 
 @pytest.fixture

@@ -25,11 +25,14 @@ from tests.helpers.repository import REPOSITORY
         (["env.learner.model=missing.xml"], "missing.xml"),
         (["trainer=pose_mapper", "trainer.num_envs=8"], "unknown key 'trainer.num_envs'; valid are name, preset"),
         (["xyz=1"], "unknown key 'xyz'"),
+        (["env=panda4dfo"], "; did you mean panda4dof?\n"),
+        (["learning_rate=1"], "; did you mean trainer.learning_rate?\n"),
     ],
 )
 def test_bad_training_input(rejected, arguments, message):
     error = rejected("train", *arguments)
-    assert message in error and ("did you mean" in error) == ("previw" in message or "num_envs" in message)
+    has_close_name = any(word in message for word in ("previw", "num_envs", "did you mean"))
+    assert message in error and ("did you mean" in error) == has_close_name
 
 
 def test_bad_input_ends_the_process_with_one_line():
@@ -84,14 +87,6 @@ def test_bad_commands(arguments, message, capsys):
     assert main(arguments) == 2
     error = capsys.readouterr().err
     assert message in error and error.startswith("error: ") and error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "name"),
-    [(["env=panda4dfo"], "panda4dof"), (["learning_rate=1"], "trainer.learning_rate")],
-)
-def test_errors_suggest_the_closest_name(arguments, name, rejected):
-    assert rejected("train", *arguments).endswith(f"; did you mean {name}?\n")
 
 
 def test_choices_suggest_the_closest_name(reason):

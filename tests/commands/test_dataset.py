@@ -292,23 +292,6 @@ def test_a_time_step_that_lerobot_does_not_have(reason, recorded, tmp_path):
     write(tmp_path / "bags", demonstrations=str(path), format="rosbag2")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["source={folder}"], "expected a folder of a LeRobot dataset, of rosbag2, HDF5 or tables"),
-        (
-            ["source={csv}", "topic=/joint_states"],
-            "topic: expected only for a LeRobot dataset, a rosbag2 or HDF5 files",
-        ),
-        (["topic=/joint_states"], "topic: expected only with source="),
-    ],
-)
-def test_bad_sources_of_demonstrations(reason, tmp_path, arguments, message):
-    (tmp_path / "motions.csv").write_text("time,joint1\n0,0\n")
-    given = (argument.format(folder=tmp_path, csv=tmp_path / "motions.csv") for argument in arguments)
-    assert message in reason("demonstrations", *given, "out=new.npz")
-
-
 def test_what_the_command_prints(recorded, tmp_path):
     assert run("dataset", f"demonstrations={recorded}", f"out={tmp_path / 'set'}") == (
         "3 episodes (3 train), 150 steps of 0.1 s\nrobot: panda, 7 joints\n"

@@ -38,13 +38,18 @@ def test_the_command_records_what_the_library_does(kind, tmp_path):
             "expected one of computed_torque, pid, reach, splines, steps, mixed, got 'dance'",
         ),
         (["out=new.npz", "count=0"], "count: expected a whole number from 1 to 100,000, got 0"),
+        (["out=new.npz", "source={folder}"], "expected a folder of a LeRobot dataset, of rosbag2, HDF5 or tables"),
+        (["out=new.npz", "source={csv}", "topic=/a"], "topic: expected only for a LeRobot dataset, a rosbag2 or HDF5"),
+        (["out=new.npz", "topic=/a"], "topic: expected only with source="),
+        (["out=new.npz", "joints=[a]"], "joints: expected only with source=FILE"),
         (["out=new.npz", "seed=-1"], "expected a whole number from 0 to 9,223,372,036,854,775,807, got -1"),
     ],
 )
 def test_bad_input_of_the_command(reason, tmp_path, arguments, message):
-    taken = tmp_path / "taken.npz"
-    taken.write_text("")
-    assert message in reason("demonstrations", *(argument.format(taken=taken) for argument in arguments))
+    paths = {"taken": tmp_path / "taken.npz", "csv": tmp_path / "motions.csv", "folder": tmp_path}
+    paths["taken"].write_text("")
+    paths["csv"].write_text("time,joint1\n0,0\n")
+    assert message in reason("demonstrations", *(argument.format(**paths) for argument in arguments))
 
 
 def test_bad_input_is_one_line(rejected):

@@ -149,16 +149,6 @@ def test_bad_evaluations(reason, run_dir, arguments, message):
     assert message in reason("evaluate", f"run={run_dir}", "compilation_cache=", *arguments)
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("mass=[0,1]", "randomization.mass: expected 2 numbers, each from 0.001 to 1000, got [0.0, 1.0]"),
-    ],
-)
-def test_bad_randomization(reason, override, message):
-    assert message in reason("train", "env=planar4dof", f"env.randomization.{override}")
-
-
 def test_unfit_demonstrations(reason, run_dir, unseen, tmp_path):
     dataclasses.replace(unseen, arm="panda").save(tmp_path / "unfit.npz")
     arguments = [f"run={run_dir}", f"demonstrations={tmp_path}/unfit.npz", "compilation_cache="]

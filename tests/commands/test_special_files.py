@@ -1,7 +1,6 @@
 """Named pipes in place of the files that commands read: one line, without waiting for a writer."""
 
 import os
-import signal
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from mimic.runs.sweeps.sweeper import SWEEP
 from mimic.trainers.run_config import load_config
 from tests.helpers.run_directories import write_run
 
+pytestmark = pytest.mark.usefixtures("in_time")
 PLANAR = "env=planar4dof"
 # A key of each command that names a file or a folder; the readers themselves are tested in tests/base/test_files.py.
 KEYS = [
@@ -27,20 +27,6 @@ KEYS = [
     ("inspect", "clip", ".trc"),
     ("view", "source", ".csv"),
 ]
-
-
-@pytest.fixture(autouse=True)
-def in_time():
-    """Ends a reader that waits."""
-
-    def stop(*_):
-        raise TimeoutError("a reader waits")
-
-    previous = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(100)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, previous)
 
 
 @pytest.mark.parametrize("case", KEYS, ids=lambda case: " ".join(case))

@@ -150,7 +150,3 @@ def test_bad_tables(reason, tmp_path, make, arguments, message):
 def test_bad_archives(reason, tmp_path, changes, message):
     path = archive(tmp_path / "motion.npz", **changes)
     assert message in reason("demonstrations", f"source={path}", "out=new.npz")
-
-
-def test_joint_names_without_a_file_are_rejected(reason):
-    assert "joints: expected only with source=FILE" in reason("demonstrations", "out=new.npz", "joints=[a]")

@@ -27,19 +27,29 @@ def qpos(seed, count=4):
 
 
 FEW: dict[str, Any] = {"starts": 2, "iterations": 4}
+
+
+def pose(q, metric, **options):
+    return imitate_pose(*arms(), q, **metric, **FEW, **options)
+
+
+DEFAULT, MOTION = MetricConfig(), {"starts": 1, "iterations": 2}
 FUNCTIONS = {
-    "imitate_pose": lambda q, metric: imitate_pose(*arms(), q, **metric, **FEW),
-    "warm": lambda q, metric: imitate_pose(*arms(), q, **metric, warm_start=q[:, :2], **FEW),
-    "imitate_trajectory": lambda q, metric: imitate_trajectory(*arms(), q, **metric, starts=1),
-    "kinematic_bound": lambda q, metric: kinematic_bound(*arms(), q, 0 * q, **metric, starts=1, iterations=2),
-    "closest_motion": lambda q, metric: closest_motion(*arms(), q, 0 * q, **metric, starts=1, iterations=2),
+    "imitate_pose": (pose, DEFAULT),
+    "key": (lambda q, metric: pose(q, metric, key=jax.random.key(int(1e4 * abs(q[0, 0])))), DEFAULT),
+    "adaptive": (pose, MetricConfig(adaptive=True)),  # functions of the metric that are equal by value
+    "soft": (pose, MetricConfig(correspondence="soft")),
+    "warm": (lambda q, metric: pose(q, metric, warm_start=q[:, :2]), DEFAULT),
+    "imitate_trajectory": (lambda q, metric: imitate_trajectory(*arms(), q, **metric, starts=1), DEFAULT),
+    "kinematic_bound": (lambda q, metric: kinematic_bound(*arms(), q, 0 * q, **metric, **MOTION), DEFAULT),
+    "closest_motion": (lambda q, metric: closest_motion(*arms(), q, 0 * q, **metric, **MOTION), DEFAULT),
 }
 
 
-@pytest.mark.slow_for("imitate_trajectory", "kinematic_bound", "warm")
+@pytest.mark.slow_for("imitate_trajectory", "kinematic_bound", "closest_motion", "warm", "soft")
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_second_call_compiles_nothing(name):
-    call, metric = FUNCTIONS[name], MetricConfig()
+    call, metric = FUNCTIONS[name]
     first = call(qpos(0), metric.build(*arms()).arguments)
     call(qpos(0), metric.build(*arms()).arguments)  # JAX's own small functions of the results
     with count_compilations() as events:
@@ -48,15 +58,6 @@ def test_a_second_call_compiles_nothing(name):
     assert events == []
     jax.tree.map(np.testing.assert_array_equal, first, second)
     assert any(np.any(a != b) for a, b in zip(jax.tree.leaves(second), jax.tree.leaves(other), strict=True))
-
-
-@pytest.mark.slow_for("metric1")
-@pytest.mark.parametrize("metric", [MetricConfig(adaptive=True), MetricConfig(correspondence="soft")])
-def test_functions_of_a_metric_config_are_equal_by_value(metric):
-    FUNCTIONS["imitate_pose"](qpos(0), metric.build(*arms()).arguments)
-    with count_compilations() as events:
-        FUNCTIONS["imitate_pose"](qpos(1), metric.build(*arms()).arguments)
-    assert events == []
 
 
 @pytest.mark.slow
@@ -72,19 +73,6 @@ def test_other_values_are_not_mixed_up():
         (expert, learner, qpos(0), jnp.ones((3, 2)), weights),
     ):
         assert np.all(np.abs(imitate_pose(*arguments, **FEW).distance - base) > 1e-4)
-
-
-def test_another_key_compiles_nothing():
-    metric = MetricConfig().build(*arms()).arguments
-
-    def call(seed):
-        return imitate_pose(*arms(), qpos(0), **metric, **FEW, key=jax.random.key(seed))
-
-    for seed in (0, 1):
-        call(seed)
-    with count_compilations() as events:
-        call(2)
-    assert events == []
 
 
 @pytest.mark.slow

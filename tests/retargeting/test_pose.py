@@ -106,7 +106,7 @@ def test_the_minimum_is_global(name):
 
 
 def test_joint_limits_are_kept():
-    expert, learner = panda(), panda(locked=(3, 6, 7), limits="hardware")
+    expert, learner = panda(), panda(locked=(3, 6, 7), limits="hardware", links="merged")
     correspondence = overlap_correspondence(expert, learner)
     solution = imitate_pose(expert, learner, poses(expert, 32), correspondence, DIRECTIONS)
     lower, upper = learner.joint_range.T
@@ -172,8 +172,6 @@ def test_shapes_and_warm_starts():
         expert, learner, qpos, correspondence, DIRECTIONS, warm_start=many.qpos.reshape(6, 2), iterations=2
     )
     np.testing.assert_allclose(warm.distance, many.distance.reshape(6), atol=1e-6)
-    mapped = jax.jit(jax.vmap(lambda pose: imitate_pose(expert, learner, pose, correspondence, DIRECTIONS)))(qpos)
-    np.testing.assert_allclose(mapped.distance, warm.distance, atol=1e-6)
 
 
 @pytest.mark.slow_for("directions-none")

@@ -112,24 +112,8 @@ def test_what_names_no_arm(body):
 
 def test_names_without_a_side_with_letters_of_anatomy(body):
     """In EPICl, EPICm the l is lateral, in STYLr, STYLu the r is radial, and in ASISl, ASISr they are sides."""
-    points = [
-        "ASISl",
-        "ASISr",
-        "ACRO_tip",
-        "CLAV_AC",
-        "SCAP_RS",
-        "ARMl",
-        "ARMm",
-        "EPICl",
-        "EPICm",
-        "LARMl",
-        "LARMm",
-        "STYLr",
-        "STYLu",
-        "WRIST",
-        "INDEX",
-    ]
-    motion = _motion(body, dict.fromkeys(points, "Head"))
+    points = "ASISl ASISr ACRO_tip CLAV_AC SCAP_RS ARMl ARMm EPICl EPICm LARMl LARMm STYLr STYLu WRIST INDEX"
+    motion = _motion(body, dict.fromkeys(points.split(), "Head"))
     assert find_arms(motion)["right"][1:] == (("ACRO_tip",), ("EPICl", "EPICm"), ("STYLr", "STYLu"), ("INDEX",))
     assert find_facing(motion) == {"left": ("ASISl",), "right": ("ASISr",)}
 
