@@ -31,14 +31,13 @@ STEPS, KNOTS = 51, 5  # samples of a motion, and poses of a spline
 COSTS = {
     "none": Costs(),
     "hand_position": Costs(hand_position=10.0),
-    "hand_orientation": Costs(hand_orientation=1.0),
     "home": Costs(home=0.3),
     "limits": Costs(limits=3.0),
     "velocity": Costs(velocity=10.0),
     "acceleration": Costs(acceleration=10.0),
     "self_collision": Costs(self_collision=0.3),
     "floor": Costs(floor=0.3),
-    "all": Costs(10.0, 1.0, 0.3, 3.0, 10.0, 10.0, 0.3, 0.3),
+    "all": Costs(10.0, 0.3, 3.0, 10.0, 10.0, 0.3, 0.3),
 }
 COLUMNS = (
     "motions cost distance:.3f similarity[centre_line_distance]:.3f similarity[frechet_distance]:.3f "

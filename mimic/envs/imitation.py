@@ -356,7 +356,7 @@ class ImitationEnv(Env):
         observed_states += [
             self.expert_at(state.demonstration, state.step + ahead) for ahead in range(self.config.preview + 1)
         ]
-        parts = [leaf.ravel() for states in observed_states for leaf in jax.tree.leaves(states)]
+        parts = [part.ravel() for states in observed_states for part in observed_parts(states)]
         return jnp.concatenate([*parts, *(observed(*term, self, state) for term in self.observation_terms)])
 
     @property
@@ -424,6 +424,18 @@ def env_class(config: EnvConfig) -> type[ImitationEnv]:
     return registered
 
 
+def observed_parts(states: LinkStates) -> list[Array]:
+    """The parts of an arm's states in an observation, in order; batch axes come first.
+
+    Of a hand these are its x- and z-axes: its position, its velocity and its y-axis follow from them and the last link.
+    """
+    parts = [values for name, values in vars(states).items() if name != "hand" and values is not None]
+    if states.hand is None:
+        return parts
+    axes = states.hand.axes
+    return [*parts, axes.reshape(*axes.shape[:-2], -1, 3, 3)[..., ::2, :]]
+
+
 def observation_layout(expert: Embodiment, learner: Embodiment, preview: int) -> list[dict[str, Any]]:
     """The parts of an observation, in order: name, shape, unit, and the indices where they start and stop."""
     observed = [("learner", learner), ("expert", expert)]
@@ -436,11 +448,9 @@ def observation_layout(expert: Embodiment, learner: Embodiment, preview: int) ->
             ("direction", links, "1"),
             ("linear_velocity", links, "chain lengths/s"),
             ("angular_velocity", links, "rad/s"),
-            ("hand position", hands, "chain lengths"),
-            ("hand axes", 3 * hands, "1"),
-            ("hand angular_velocity", hands, "rad/s"),
+            ("hand x- and z-axes", 2 * hands, "1"),
         ]
-        for name, rows, unit in parts[: 7 if hands else 4]:
+        for name, rows, unit in parts[: 5 if hands else 4]:
             stop = start + 3 * rows
             shape = [rows, 3]
             layout.append({"name": f"{arm_name}: {name}", "shape": shape, "unit": unit, "start": start, "stop": stop})

@@ -1,5 +1,6 @@
 """What a rollout is compared with: the kinematic bound, holding the start pose, and motions without learning."""
 
+import contextlib
 from typing import Any, NamedTuple
 
 import jax
@@ -21,6 +22,7 @@ from mimic.retargeting.pose_baselines import baseline_poses
 Motions = Float[np.ndarray, "rows time joints"]
 CONTROLLER = "controller"  # the name of the zero action's motions
 _CHUNK = 256  # demonstrations whose bound is searched at a time
+_FEW = 1024  # demonstrations of which the bound takes less time on the CPU, where it compiles several times faster
 
 
 class References(NamedTuple):
@@ -73,8 +75,7 @@ def _lower_bound(env: ImitationEnv, qpos: Motions, qvel: Motions) -> tuple[np.nd
     count = len(qpos)
     size = min(count, _CHUNK)
     padded = np.minimum(np.arange(-(-count // size) * size), count - 1).reshape(-1, size)
-    # On the CPU, where the function compiles several times faster; it runs only once.
-    with on_host():
+    with on_host() if count <= _FEW else contextlib.nullcontext():
         search = jax.jit(jax.vmap(closest))
         chunks = [search(qpos[rows].astype(np.float32), qvel[rows].astype(np.float32)) for rows in padded]
         distance, poses = (np.concatenate([np.asarray(chunk[i]) for chunk in chunks])[:count] for i in range(2))

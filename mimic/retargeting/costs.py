@@ -13,7 +13,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.base import spatial
 from mimic.base.ranges import check_ranges, number
 from mimic.metric.capsule_distances import capsule_axes, intrusion, pair_distances
-from mimic.metric.kinematics import LinkStates, forward_kinematics, joint_frames
+from mimic.metric.kinematics import LinkStates, joint_frames
 from mimic.retargeting.closed_form import SMOOTHING, Smoothing
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
 from mimic.retargeting.pose_objective import PoseObjective, Target, automatic_derivatives
@@ -33,7 +33,6 @@ class Costs:
     Attributes:
       hand_position: squared distance of the tips of the centre lines, each in its arm's chain lengths; of trees, the
         sum over the pairs of corresponding chains.
-      hand_orientation: 1 - cos of the angle between the frames of the last links, likewise.
       home: mean over the joints of the squared distance from the home pose, in half ranges.
       limits: mean over the joints of the squared intrusion into the last tenth of the range at each end; 1 at a limit.
       velocity, acceleration: mean over the joints of the squared first and second difference of the angles [rad^2] from
@@ -46,7 +45,6 @@ class Costs:
     """
 
     hand_position: float = _weight()
-    hand_orientation: float = _weight()
     home: float = _weight()
     limits: float = _weight()
     velocity: float = _weight()
@@ -62,7 +60,7 @@ class Costs:
     @property
     def of_pose(self) -> bool:
         """Whether a cost of single poses has a weight."""
-        return any((self.hand_position, self.hand_orientation, self.home, self.limits, self.of_capsules))
+        return any((self.hand_position, self.home, self.limits, self.of_capsules))
 
     @property
     def of_capsules(self) -> bool:
@@ -93,8 +91,8 @@ def pose_cost(
 ) -> Float[Array, ""]:
     """Weighted sum of the costs of a learner's pose."""
     total = jnp.zeros((), qpos.dtype)
-    if costs.hand_position or costs.hand_orientation:
-        total += hand_cost(expert, learner, expert_qpos, qpos, costs.hand_position, costs.hand_orientation)
+    if costs.hand_position:
+        total += costs.hand_position * hand_cost(expert, learner, expert_qpos, qpos)
     if costs.home or costs.limits:
         total += costs.home * home_cost(learner, qpos) + costs.limits * limit_cost(learner, qpos)
     if costs.of_capsules and capsules is not None:
@@ -109,23 +107,14 @@ def pose_cost(
     return total
 
 
-def hand_cost(
-    expert: Embodiment, learner: Embodiment, expert_qpos: Array, qpos: Array, position: float, orientation: float
-) -> Float[Array, ""]:
-    """Weighted costs of the position of the tips and the orientation of the last links, summed over pairs of chains."""
-    arms = (expert, expert_qpos), (learner, qpos)
+def hand_cost(expert: Embodiment, learner: Embodiment, expert_qpos: Array, qpos: Array) -> Float[Array, ""]:
+    """Squared distance of the tips, summed over pairs of chains."""
     pairs = np.array(matched_chains(expert.chain_names, learner.chain_names)).T
     points = [
         tip_positions(arm, q)[chains] / spatial.scalar(arm.chain_length)
-        for (arm, q), chains in zip(arms, pairs, strict=True)
+        for (arm, q), chains in zip(((expert, expert_qpos), (learner, qpos)), pairs, strict=True)
     ]
-    total = position * jnp.sum((points[0] - points[1]) ** 2)
-    if not orientation:
-        return total
-    last = [np.array([chain[-1] for chain in arm.chains])[chains] for (arm, _), chains in zip(arms, pairs, strict=True)]
-    rotations = [forward_kinematics(arm, q).rotation[links] for (arm, q), links in zip(arms, last, strict=True)]
-    # |R - S|^2 = 4 (1 - cos) of the angle of R^T S, without cancellation at a match.
-    return total + orientation / 4 * jnp.sum((rotations[0] - rotations[1]) ** 2)
+    return jnp.sum((points[0] - points[1]) ** 2)
 
 
 def tip_positions(arm: Embodiment, qpos: Float[Array, " joints"]) -> Float[Array, "chains 3"]:

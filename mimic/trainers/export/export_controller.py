@@ -17,7 +17,7 @@ from mimic.control import joint_control
 from mimic.control.joint_control import JointParameters
 from mimic.deploy.bundle import write_bundle
 from mimic.deploy.safety import check_supported
-from mimic.envs.imitation import observation_layout
+from mimic.envs.imitation import observation_layout, observed_parts
 from mimic.envs.world_env import SENT_ACTIONS, HardwareEnv
 from mimic.metric.kinematics import LinkStates, link_states
 from mimic.retargeting.clearance import clearance_constants
@@ -82,8 +82,8 @@ def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable
 def expert_table(env: HardwareEnv) -> np.ndarray:
     """The expert's link states [demonstrations, ticks + 1, numbers], as the policy observes them."""
     states: LinkStates = jax.tree.map(lambda x: np.asarray(x)[:, : env.config.horizon + 1], env.expert_states)
-    leaves = [leaf.reshape(*leaf.shape[:2], -1) for leaf in jax.tree.leaves(states)]
-    return np.concatenate(leaves, axis=-1).astype(np.float32)
+    parts = [part.reshape(*part.shape[:2], -1) for part in observed_parts(states)]
+    return np.concatenate(parts, axis=-1).astype(np.float32)
 
 
 def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
@@ -111,7 +111,7 @@ def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
 
     def action(*values: jax.Array) -> dict[str, jax.Array]:
         qpos, qvel, reference_qpos, reference_qvel, past_actions, features = values
-        states = [leaf.ravel() for leaf in jax.tree.leaves(link_states(env.learner, qpos, qvel))]
+        states = [part.ravel() for part in observed_parts(link_states(env.learner, qpos, qvel))]
         own = jnp.concatenate([*states, reference_qpos, reference_qvel, past_actions])
         hidden = features + first_layer(~is_expert, own)
         for layer in layers[1:-1]:

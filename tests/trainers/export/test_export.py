@@ -94,10 +94,9 @@ def test_the_metadata_describes_inputs_and_outputs(policy):
     own = mimic.link_states(env.learner, state.pipeline_state.qpos)
     ahead = env.expert_at(state.pipeline_state.demonstration, jnp.array(1))
     for whose, states in {"learner": own, "expert 1 steps ahead": ahead}.items():
-        hand = {f"hand {name}": values for name, values in vars(states.hand).items()}
-        for name, values in {**vars(states), **hand}.items():
-            if name == "hand":
-                continue
+        parts = {name: values for name, values in vars(states).items() if name != "hand"}
+        parts["hand x- and z-axes"] = states.hand.axes[jnp.array([0, 2])]
+        for name, values in parts.items():
             part = layout[f"{whose}: {name}"]
             observed = state.obs[part["start"] : part["stop"]].reshape(part["shape"])
             np.testing.assert_allclose(observed, values, atol=1e-6)
