@@ -48,7 +48,8 @@ class ImitationEnv(Env):
 
     Reward: minus the embodiment distance to the expert after the step; with hardware limits also minus `limit_weight`
     times `limit_excess`. Observation: link states of the learner, of the expert now, and of the expert at each of the
-    next `preview` steps, as one vector. Action: a torque for each joint in [-1, 1], scaled by `torque_scale`. The
+    next `preview` steps, then the learner's joints, as one vector. Link states alone do not show the angles where two
+    axes coincide, as those of a Panda's joints 1 and 3 where joint 2 is at 0. Action: a torque for each joint in [-1, 1], scaled by `torque_scale`. The
     episode terminates at the horizon, because there is nothing to imitate after it; this is no truncation.
     The config's `reward.terms` and `observation.terms` add to reward and observation.
 
@@ -330,7 +331,7 @@ class ImitationEnv(Env):
     def observe(self, state: ArmState) -> Float[Array, " observation"]:
         """The observation: the learner's link states, then the expert's now and at each of the next `preview` steps.
 
-        The values of the config's `observation.terms` follow.
+        Sines, cosines and velocities of the learner's joints follow, then the config's `observation.terms`.
 
         A subclass may override it: every observation of the environment is then the subclass's.
         """
@@ -357,6 +358,7 @@ class ImitationEnv(Env):
             self.expert_at(state.demonstration, state.step + ahead) for ahead in range(self.config.preview + 1)
         ]
         parts = [part.ravel() for states in observed_states for part in observed_parts(states)]
+        parts += [jnp.sin(state.qpos), jnp.cos(state.qpos), state.qvel]
         return jnp.concatenate([*parts, *(observed(*term, self, state) for term in self.observation_terms)])
 
     @property
@@ -438,6 +440,18 @@ def observed_parts(states: LinkStates) -> list[Array]:
 
 def observation_layout(expert: Embodiment, learner: Embodiment, preview: int) -> list[dict[str, Any]]:
     """The parts of an observation, in order: name, shape, unit, and the indices where they start and stop."""
+    layout = link_layout(expert, learner, preview)
+    start, joints = layout[-1]["stop"], learner.num_joints
+    for name, unit in (("sines of the angles", "1"), ("cosines of the angles", "1"), ("joint velocities", "rad/s")):
+        layout.append(
+            {"name": f"learner: {name}", "shape": [joints], "unit": unit, "start": start, "stop": start + joints}
+        )
+        start += joints
+    return layout
+
+
+def link_layout(expert: Embodiment, learner: Embodiment, preview: int) -> list[dict[str, Any]]:
+    """The parts of an observation that are link states, as in `observation_layout`."""
     observed = [("learner", learner), ("expert", expert)]
     observed += [(f"expert {ahead} steps ahead", expert) for ahead in range(1, preview + 1)]
     layout, start = [], 0

@@ -14,7 +14,7 @@ from mimic.control import joint_control
 from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target
 from mimic.envs.arm_state import ArmState
 from mimic.envs.config import EnvConfig
-from mimic.envs.imitation import ImitationEnv
+from mimic.envs.imitation import ImitationEnv, observed_parts
 from mimic.envs.world_state import HardwareState
 from mimic.metric.capsule_distances import colliding_pairs
 from mimic.metric.kinematics import LinkStates, link_states
@@ -216,7 +216,7 @@ def _pushed(history: Float[Array, "ticks numbers"], newest: Float[Array, " numbe
 
 def expert_vector(states: list[LinkStates]) -> Float[Array, " numbers"]:
     """Link states of the expert now and at the next ticks, as one vector."""
-    return jnp.concatenate([leaf.ravel() for of_tick in states for leaf in jax.tree.leaves(of_tick)])
+    return jnp.concatenate([part.ravel() for of_tick in states for part in observed_parts(of_tick)])
 
 
 def control_observation(
@@ -234,7 +234,7 @@ def control_observation(
       expert: see `expert_vector`.
     """
     qpos, qvel, reference_qpos, reference_qvel = jnp.split(measured, 4)
-    own = jax.tree.leaves(link_states(env.learner, qpos, qvel))
+    own = observed_parts(link_states(env.learner, qpos, qvel))
     home = np.asarray(env.learner.home, np.float32)
-    parts = [*(leaf.ravel() for leaf in own), expert, reference_qpos - home, reference_qvel, past_actions]
+    parts = [*(part.ravel() for part in own), expert, reference_qpos - home, reference_qvel, past_actions]
     return jnp.concatenate(parts)

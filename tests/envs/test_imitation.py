@@ -86,6 +86,7 @@ def test_reward_and_observation_follow_the_demonstration_step_by_step():
                 *(states.hand.axes[0], states.hand.axes[2]),
             )
         ]
+        parts += [np.sin(arm.qpos), np.cos(arm.qpos), arm.qvel]
         np.testing.assert_allclose(state.obs, np.concatenate(parts), atol=1e-5)
         assert state.done == (i == 6)
         distances = [distance(each, learner) for each in expert]

@@ -17,7 +17,7 @@ from mimic.control import joint_control
 from mimic.control.joint_control import JointParameters
 from mimic.deploy.bundle import write_bundle
 from mimic.deploy.safety import check_supported
-from mimic.envs.imitation import observation_layout, observed_parts
+from mimic.envs.imitation import link_layout, observed_parts
 from mimic.envs.world_env import SENT_ACTIONS, HardwareEnv
 from mimic.metric.kinematics import LinkStates, link_states
 from mimic.retargeting.clearance import clearance_constants
@@ -94,7 +94,7 @@ def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
     """
     statistics, policy, *_ = params
     layers = [policy["params"][f"hidden_{index}"] for index in range(len(policy["params"]))]
-    layout = observation_layout(env.expert, env.learner, env.config.preview)
+    layout = link_layout(env.expert, env.learner, env.config.preview)
     own_links = next(part["start"] for part in layout if part["name"].startswith("expert"))
     joints, expert_size = env.learner.num_joints, layout[-1]["stop"] - own_links
     is_expert = np.zeros(env.observation_size, bool)
