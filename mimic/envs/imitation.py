@@ -49,8 +49,9 @@ class ImitationEnv(Env):
     Reward: minus the embodiment distance to the expert after the step; with hardware limits also minus `limit_weight`
     times `limit_excess`. Observation: link states of the learner, of the expert now, and of the expert at each of the
     next `preview` steps, then the learner's joints, as one vector. Link states alone do not show the angles where two
-    axes coincide, as those of a Panda's joints 1 and 3 where joint 2 is at 0. Action: a torque for each joint in [-1, 1], scaled by `torque_scale`. The
-    episode terminates at the horizon, because there is nothing to imitate after it; this is no truncation.
+    axes coincide, as those of a Panda's joints 1 and 3 where joint 2 is at 0. Action: a torque for each joint in
+    [-1, 1], scaled by `torque_scale`. The episode terminates at the horizon, because there is nothing to imitate after
+    it; this is no truncation.
     The config's `reward.terms` and `observation.terms` add to reward and observation.
 
     A subclass may override `observe`, as one vector of any length, and `start`: `reset`, `step` and `restart_done` call
