@@ -128,28 +128,29 @@ def kinds_of_motions(training: Results) -> list[Cells]:
 
 def unseen_motions(motions: Results) -> list[Cells]:
     """Gap of the policy and of controllers without learning on each set and kind of motions, by environment."""
-    names = ("policy", "copy_joints", "one_step", "nearest_pose", "computed_torque")
-    rows: list[Cells] = [("joints", "motions", "policy: gap, 95 % interval [%]", *(f"`{name}`" for name in names[1:]))]
+    names = ("copy_joints", "one_step", "nearest_pose", "computed_torque")
+    rows: list[Cells] = [("joints", "motions", "policy: gap, 95 % interval [%]", *(f"`{name}`" for name in names))]
     keys = dict.fromkeys((row["env"], row["set"], row["kind"]) for row in motions["rows"])
     for env, which, kind in keys:
         found = where(motions["rows"], env=env, set=which, kind=kind)
-        gaps = {row["controller"]: row for row in found}
-        policy = gaps["policy"]
-        text = f"{100 * policy['gap']:.2f}, {100 * policy['low']:.2f} to {100 * policy['high']:.2f}"
-        others = (f"{100 * gaps[name]['gap']:.2f}" if name in gaps else "" for name in names[1:])
-        rows.append((ENVIRONMENTS[env].split()[-1], f"{which}: {kind.replace('_', ' ')}", text, *others))
+        gaps = {row["controller"]: row for row in found if row["gap"] is not None}
+        if "policy" in gaps:
+            others = (f"{100 * gaps[name]['gap']:.2f}" if name in gaps else "" for name in names)
+            label = f"{which}: {kind.replace('_', ' ')}"
+            gap, low, high = (f"{100 * gaps['policy'][key]:.2f}" for key in ("gap", "low", "high"))
+            rows.append((ENVIRONMENTS[env].split()[-1], label, f"{gap}, {low} to {high}", *others))
     return rows
 
 
-def overview(training: Results, pose: Results) -> list[Cells]:
-    """The table of the README."""
-    _, *kinds = kinds_of_motions(training)
+def overview(motions: Results, pose: Results) -> list[Cells]:
+    """The table of the README: interval of the policy's gap on each kind of test motions, and poses per second."""
     rates = {result["pair"]: large(result["methods"]["newton"]["poses_per_second"]) for result in pose["results"]}
-    return [
-        ("", "7 joints", "4 joints", "3 joints"),
-        *((f"{kind} [%]", *(cell.replace(" to ", "–") for cell in cells)) for kind, *cells in kinds[:-1]),
-        ("poses at their optimum per second", rates["panda 7->7"], rates["panda 7->4"], ""),
-    ]
+    test = where(motions["rows"], set="test", controller="policy")
+    rows: list[Cells] = [("test motions", *(f"{pair.split()[-1]} joints" for pair in ENVIRONMENTS.values()))]
+    for kind in dict.fromkeys(row["kind"] for row in test):
+        gaps = {row["env"]: f"{100 * row['low']:.2f}–{100 * row['high']:.2f}" for row in where(test, kind=kind)}
+        rows.append((f"`{kind}` [%]", *(gaps[env] for env in ENVIRONMENTS)))
+    return [*rows, ("poses at their optimum per second", rates["panda 7->7"], rates["panda 7->4"], "")]
 
 
 def main_results(

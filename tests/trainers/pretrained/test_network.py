@@ -18,7 +18,7 @@ from mimic.trainers.pretrained.files import PARAMETERS, read_params, write_netwo
 from mimic.trainers.pretrained.network import NETWORKS, TRAINERS, names_of_one_learner, pretrained_names, read_network
 
 MAX_BYTES = 5_000_000  # of all of them: the package stays small
-OBSERVATION = 12 * (4 + 2 * 7) + 15 * 3  # of planar4dof: links and hands of the learner and of the expert, now and next
+OBSERVATION = 246  # numbers that the policy of planar4dof observes
 DEFAULT = ("panda3dof", "panda4dof", "panda7dof", "planar4dof", "planar7dof")
 POLICIES, MAPPERS = (names_of_one_learner(kind) for kind in TRAINERS)
 FOLDERS = [f"{name}-{kind}" for kind in TRAINERS for name in names_of_one_learner(kind)]
