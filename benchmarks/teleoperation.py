@@ -46,10 +46,11 @@ SPEED = {
     "so101": [4.7] * 5,
     "ur5e": SPEEDS["ur5e"],
 }
-BASE = [-0.21, 0.0, 0.0, 0.0]  # of the Piper in the SO-101's base frame, from `find_base` and then rounded
+BASE = [0.0, 0.115, 0.03, -0.535]  # of the Piper in the SO-101's base frame, from `find_base`, rounded
 PAIRS = ("panda-ur5e", "ur5e-panda", "so101-panda", "panda-so101", "person-panda")
 FAULTS = ("lost", "stalled", "jumped", "displaced", "not finite", "backwards")
 _RATE, _LOST = 100.0, 0.3  # Hz; fraction of samples that are lost
+_TIMED = 3  # episodes
 
 
 def arm(name: str, options: argparse.Namespace) -> Embodiment:
@@ -150,19 +151,20 @@ def episodes(options: argparse.Namespace) -> Iterator[Row]:
         qpos = np.concatenate(paths)
         operator = mimic.Teleoperator(leader, follower, base=BASE, rate=rate, velocity=SPEED["piper"])
         runs = [driven(operator, path)[0] for path in paths]
-        bound = np.concatenate([np.asarray(nearest(chunk).distance) for chunk in chunks(qpos)])[: len(qpos)]
+        judged = slice(None, None, round(rate / 15))  # as many as were recorded
+        bound = np.concatenate([np.asarray(nearest(chunk).distance) for chunk in chunks(qpos[judged])])
         ways = {"mimic": np.concatenate(runs)}
         if rate != _RATE:
             ways["recorded"] = np.concatenate(recorded)
         of_limits = [ratios(run, operator, rate) for run in runs]
         for method, own in ways.items():
             mine, base = method == "mimic", BASE if method == "mimic" else None
-            apart = [np.asarray(distance(*part)) for part in zip(chunks(qpos), chunks(own), strict=True)]
-            within = np.concatenate(apart)[: len(qpos)] <= 1.05 * bound + 1e-6
+            pairs = zip(chunks(qpos[judged]), chunks(own[judged]), strict=True)
+            within = np.concatenate([np.asarray(distance(*pair)) for pair in pairs]) <= 1.05 * bound + 1e-6
             row = {"method": method, "rate": rate, "frames": len(qpos)}
             row |= hand_errors(leader, follower, base, qpos, own) | resemblance(leader, follower, base, qpos, own)
             if mine:
-                row |= {"bound": within.mean(), "violations": sum(x[2] for x in of_limits)}
+                row |= {"bound": within[: len(qpos[judged])].mean(), "violations": sum(x[2] for x in of_limits)}
                 row |= {"of_limits": max(x[0] for x in of_limits), "stalled_s": stalled(runs, paths, rate)}
             yield as_numbers(row)
 
@@ -287,7 +289,7 @@ def core_seconds(count: int = 2000) -> np.ndarray:
 
 def times(options: argparse.Namespace) -> Iterator[Row]:
     leader, follower = arm("so101", options), arm("piper", options)
-    qpos = np.concatenate([resampled(path, 15.0) for path in recordings(leader, "deg", options)[:8]])
+    qpos = np.concatenate([resampled(path, 15.0) for path in recordings(leader, "deg", options)[:_TIMED]])
     targets = np.linalg.inv(homogeneous(*placement(BASE))) @ hand_matrices(leader, qpos)
     operator = mimic.Teleoperator(leader, follower, base=BASE, velocity=SPEED["piper"], rate=_RATE)
     methods: dict[str, Callable[[], tuple[np.ndarray, np.ndarray]]] = {

@@ -24,6 +24,7 @@ from mimic.retargeting.pose import wrap_angles
 HANDS = ("exact", "relative")
 STATES = ("tracking", "nearest", "catching up", "approaching", "holding", "waiting", "disengaged")
 _TOLERANCE = 1e-3, np.radians(0.5)  # m, rad: hands that are nearer count as reached
+_STEP_TIME, _MAX_STEPS = 0.015, 5  # s of a tick for each step of the posture, and steps at most
 _MAX_SPEED = 4 * np.pi  # rad/s of a leader; a sample that moved faster is a jump
 _PATIENCE = 0.12  # s after which samples that agree with each other count, though they jumped or time ran backwards
 _TIMEOUT = 0.2  # s without a sample, after which the follower is said to hold
@@ -121,6 +122,7 @@ class Teleoperator:
         self._samples = _Samples(leader, self._period)
         self._gripper = _Gripper(*grippers, self._period)
         self._limiter = _Limiter(self.limits, self._period)
+        self._steps = int(np.clip(np.ceil(self._period / _STEP_TIME), 1, _MAX_STEPS))
         self._smoothing = 1 - np.exp(-self._period / _SPEED_TIME)
         self._random = np.random.default_rng(0)
         self._lower, self._upper = self.limits.position.T
@@ -209,7 +211,10 @@ class Teleoperator:
         """Moves the posture towards the goal, and the path towards the posture."""
         reach = self.limits.velocity * self._period
         lower, upper = np.maximum(self._lower, self._posture - reach), np.minimum(self._upper, self._posture + reach)
-        posture, _ = self._pose.step(goal, self._posture[None], lower, upper, NEAR, self._left, self._posture_rows)
+        posture, rows = self._posture[None], self._posture_rows
+        for _ in range(self._steps):
+            posture, _ = self._pose.step(goal, posture, lower, upper, NEAR, self._left, rows)
+            rows = None
         moved, self._posture = posture[0] - self._posture, posture[0]
         # A path that goes as fast as it may ends at once, where the command must be able to stop.
         is_free = self._is_near and bool(np.all(np.abs(moved) < _FREE * reach))
