@@ -159,6 +159,9 @@ def test_a_model_is_found_from_any_folder(tmp_path, monkeypatch):
 LAUGHS = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
 BOMB = f'<?xml version="1.0"?><!DOCTYPE m [<!ENTITY l0 "ha">{LAUGHS}]><mujoco model="&l9;"/>'
 FILES = {
+    "missing": (None, "no MJCF or URDF file at '.*arm.xml'$"),
+    "not xml": ("joint1 = 3", "'.*arm.xml' is not an MJCF or URDF model that MuJoCo can read: "),
+    "misspelt": ("<mujoco><worldbody><boby/></worldbody></mujoco>", "'.*arm.xml' is not an MJCF or URDF model .*boby"),
     "an entity bomb": (BOMB, "'.*arm.xml' declares a document type or entities; expected plain MJCF or URDF$"),
     "a missing mesh": (
         '<mujoco><asset><mesh name="a" file="a.stl"/></asset>'
@@ -181,7 +184,8 @@ FILES = {
 def test_bad_files_are_rejected(tmp_path, case):
     content, message = FILES[case]
     file = tmp_path / "arm.xml"
-    file.write_text(content)
+    if content is not None:
+        file.write_text(content)
     with pytest.raises(ValueError, match=f"^{message}") as error:
         mimic.load_mjcf(file)
     assert "\n" not in str(error.value)

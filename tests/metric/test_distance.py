@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic.arms.embodiment import panda, planar_arm
+from mimic.arms.embodiment import load_mjcf, panda, planar_arm
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
 from mimic.metric.distance import (
     PAPER_WEIGHTS,
@@ -29,6 +29,7 @@ from tests.helpers.metric_cases import (
     WEIGHTS,
     states,
 )
+from tests.helpers.random_arms import random_arm
 
 # --- values -----------------------------------------------------------------------------------------------------------
 
@@ -115,9 +116,10 @@ def test_zero_exactly_at_a_match_and_only_there(arm, weights, rotation):
 
 @pytest.mark.parametrize("rotation", MEASURES)
 def test_swapping_the_arms_transposes_the_distances(x64, rotation):
-    a, b = states(panda(), 0, np.float64), states(planar_arm([0.1, 0.2]), 1, np.float64)
+    spatial = load_mjcf(random_arm(2))  # 3 joints
+    a, b = states(spatial, 0, np.float64), states(planar_arm([0.1, 0.2]), 1, np.float64)
     forth, back = (link_distances(*pair, ALL_WEIGHTS, rotation=rotation) for pair in ((a, b), (b, a)))
-    assert forth.shape == (7, 2)
+    assert forth.shape == (spatial.num_links, 2)
     np.testing.assert_allclose(forth, back.T, atol=1e-15)  # the order of two factors
 
 

@@ -160,11 +160,8 @@ def test_similarity_of_trees(body, longer):
 
 def test_hand_costs_of_both_hands(x64, body):
     qpos = pose(body)[0]
-    moved = qpos.copy()
-    moved[body.joint_names.index("left_joint2")] += 0.3
-    left = float(hand_cost(body, body, qpos, moved, 1.0, 1.0))
-    moved[body.joint_names.index("right_joint2")] += 0.3
-    assert (
-        float(hand_cost(body, body, qpos, qpos, 1.0, 1.0)) == 0
-        and float(hand_cost(body, body, qpos, moved, 1.0, 1.0)) > left > 0
-    )
+    moved = np.stack([qpos] * 3)  # not at all, the left hand, and both
+    moved[1:, body.joint_names.index("left_joint2")] += 0.3
+    moved[2, body.joint_names.index("right_joint2")] += 0.3
+    none, left, both = jax.jit(jax.vmap(lambda q: hand_cost(body, body, qpos, q, 1.0, 1.0)))(moved)
+    assert abs(none) < 1e-12 < 1e-3 < left < both
