@@ -220,6 +220,8 @@ class Teleoperator:
         is_free = self._is_near and bool(np.all(np.abs(moved) < _FREE * reach))
         self._speed = self._speed + self._smoothing * (moved / self._period - self._speed) if is_free else 0 * moved
         self._search(goal)
+        if self._lanes is not None and not self._is_near:
+            return  # where an approach goes is not known yet
         away = self._posture - self._path
         fraction = np.max(np.abs(away) / (reach * (1.0 if self._is_near else _APPROACH)))
         self._is_near |= fraction <= 1
@@ -408,6 +410,8 @@ class _Limiter:
 
     def _next(self) -> np.ndarray:
         result = self._ruckig.update(self._input, self._output)
+        if result < 0 and self._input.control_interface == self._interfaces.Position:
+            return self.brake()  # a goal that it cannot compute
         if result < 0:
             raise RuntimeError(f"ruckig: {result}")
         self._output.pass_to_input(self._input)
