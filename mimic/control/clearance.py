@@ -1,132 +1,98 @@
-"""Frames and clearance of an arm by few operations on matrices, for a period of 1 ms.
+"""The clearance of an arm: how far its capsules are from each other and from the floor, without JAX.
 
-`xp` is the array library of the arguments, `numpy` or `jax.numpy`. The constants are those of
-`mimic.metric.matrix_kinematics` and `mimic.retargeting.clearance`.
+`xp` is the array library of the arguments, `numpy` on a robot or `jax.numpy`. `mimic.metric.capsule_distances` computes
+the same distances for optimisation, in scalar arithmetic: that is fast on GPUs, but takes milliseconds on a CPU.
 """
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 Array = Any
-
-
-class FrameConstants(NamedTuple):
-    """Of an arm, for `joint_frames`.
-
-    Attributes:
-      parent: of each joint, -1 at the base.
-      constant: [16 joints] of the motions about the joints.
-      factors: [2 joints, 16 joints] of the sines and then the cosines of the angles.
-    """
-
-    parent: Array
-    constant: Array
-    factors: Array
+_TINY = 1e-12  # m^2, replaces the squared length of a capsule that is a sphere
+_PARALLEL = 1e-6  # squared sine of an angle: float32 resolves no smaller angle
+_FAR = 1e3  # m: the clearance of an arm of which nothing is checked
 
 
 class ClearanceConstants(NamedTuple):
-    """Of an arm, for `clearance`. Each of its pairs of capsules has the axes from p along u and from q along v.
+    """An arm with its capsules in the zero pose, in the base frame [m].
 
     Attributes:
-      parent, constant, factors: see `FrameConstants`.
-      moved: [4 joints, 4 pairs + points] of which joint_frames @ moved + fixed are u, v, w = p - q and again u of all
-        pairs, then the points whose height is checked [m].
-      fixed: [3, 4 pairs + points].
-      squared_v: [pairs] v.v [m^2].
-      per_u, per_v: [pairs] the inverses of u.u and v.v, of spheres a large number [1/m^2].
-      product: [pairs] u.u v.v [m^4].
-      parallel: [pairs] below this determinant u and v are taken as parallel [m^4].
-      radii: [pairs] sums of the radii [m].
-      heights: [points] minimum heights [m].
+      parent: [joints] of each joint, -1 at the base.
+      axis, anchor: [joints, 3] unit axes, and a point on each.
+      joint: [capsules] last joint that moves each capsule, -1 for the base.
+      start, end: [capsules, 3] ends of their axes.
+      radius: [capsules].
+      pairs: [pairs, 2] capsules that are checked against each other.
+      above: [checked] capsules whose height above the floor is checked.
+      floor_height: of the floor.
     """
 
     parent: Array
-    constant: Array
-    factors: Array
-    moved: Array
-    fixed: Array
-    squared_v: Array
-    per_u: Array
-    per_v: Array
-    product: Array
-    parallel: Array
-    radii: Array
-    heights: Array
+    axis: Array
+    anchor: Array
+    joint: Array
+    start: Array
+    end: Array
+    radius: Array
+    pairs: Array
+    above: Array
+    floor_height: Array
 
 
-def joint_frames(qpos: Array, constants: FrameConstants | ClearanceConstants, xp: Any) -> Array:
-    """Motions of the joints' child bodies from the zero pose, [..., 3, 4 joints].
-
-    They are the upper rows of homogeneous matrices in the base frame, side by side.
-
-    Args:
-      qpos: angles [..., joints] [rad].
-      constants: of the arm.
-      xp: array library.
-    """
-    joints, batch = qpos.shape[-1], qpos.shape[:-1]
-    angles = xp.concatenate([xp.sin(qpos), xp.cos(qpos)], axis=-1)
-    motions = (angles @ constants.factors + constants.constant).reshape(*batch, 4 * joints, 4)
-    frames: list[Array] = []
-    for joint, parent in enumerate(constants.parent):
-        row = 4 * joint
-        if parent < 0:
-            frames.append(motions[..., row : row + 3, :])
-        else:
-            frames.append(frames[parent] @ motions[..., row : row + 4, :])
-    return xp.concatenate(frames, axis=-1)
-
-
-def moved_points(frames: Array, moved: Array, fixed: Array) -> Array:
-    """Points and directions of an arm's bodies in a pose, [..., 3, points]: frames @ moved + fixed."""
-    columns = frames.reshape(-1, frames.shape[-1]) @ moved  # of all poses in one product
-    return columns.reshape(*frames.shape[:-1], moved.shape[-1]) + fixed
-
-
-def clearance(qpos: Array, constants: ClearanceConstants, xp: Any) -> Array:
+def clearance(qpos: Array, arm: ClearanceConstants, xp: Any) -> Array:
     """The clearance [...] [m] of an arm in poses [..., joints] [rad], negative where something touches.
 
-    It is the minimum distance of the pairs of capsules, and of points from their minimum heights.
+    It is the minimum distance of the pairs of capsules, and of capsules from the floor.
 
     Args:
       qpos: angles.
-      constants: of the arm.
+      arm: the arm.
       xp: array library.
     """
-    vectors = moved_points(joint_frames(qpos, constants, xp), constants.moved, constants.fixed)
-    pairs = constants.radii.shape[-1]
-    heights = vectors[..., 2, 4 * pairs :] - constants.heights
-    distances = _pair_distances(vectors[..., : 4 * pairs], constants, xp)
-    return xp.concatenate([distances, heights], axis=-1).min(axis=-1)
+    start, end = capsule_axes(qpos, arm, xp)
+    i, j = arm.pairs[:, 0], arm.pairs[:, 1]
+    axes = start[..., i, :], end[..., i, :], start[..., j, :], end[..., j, :]
+    distances = _segment_distances(*axes, xp) - (arm.radius[i] + arm.radius[j])
+    lowest = xp.minimum(start[..., arm.above, 2], end[..., arm.above, 2])
+    heights = lowest - (arm.radius[arm.above] + arm.floor_height)
+    nothing = xp.full_like(qpos[..., :1], _FAR)
+    return xp.concatenate([distances, heights, nothing], axis=-1).min(axis=-1)
 
 
-def _pair_distances(vectors: Array, constants: ClearanceConstants, xp: Any) -> Array:
-    """Distances [..., pairs], as `mimic.retargeting.costs.segment_distance` computes those of the axes.
-
-    Args:
-      vectors: u, v, w and again u of the pairs, [..., 3, 4 pairs].
-      constants: of the arm.
-      xp: array library.
-    """
-    pairs = constants.radii.shape[-1]
-    dots = _sum(vectors[..., : 3 * pairs] * vectors[..., pairs:])
-    uv, vw, uw = dots[..., :pairs], dots[..., pairs : 2 * pairs], dots[..., 2 * pairs :]
-    determinant = constants.product - uv * uv
-    quotient = (uv * vw - constants.squared_v * uw) / xp.maximum(determinant, constants.parallel)
-    s = xp.where(determinant <= constants.parallel, 0.5, quotient)
-    s = _fraction(s, xp)
-    t = _fraction((uv * s + vw) * constants.per_v, xp)
-    s = _fraction((uv * t - uw) * constants.per_u, xp)
-    t = _fraction((uv * s + vw) * constants.per_v, xp)
-    u, v, w = vectors[..., :pairs], vectors[..., pairs : 2 * pairs], vectors[..., 2 * pairs : 3 * pairs]
-    difference = w + s[..., None, :] * u - t[..., None, :] * v
-    return xp.sqrt(_sum(difference * difference)) - constants.radii
+def capsule_axes(qpos: Array, arm: ClearanceConstants, xp: Any) -> tuple[Array, Array]:
+    """Ends [..., capsules, 3] of the capsules' axes in poses [m]; see `clearance`."""
+    batch, identity = qpos.shape[:-1], np.eye(3, dtype=arm.axis.dtype)
+    rotations = [xp.broadcast_to(identity, (*batch, 3, 3))]  # of the bodies from the zero pose, the base first
+    shifts = [xp.broadcast_to(0 * identity[0], (*batch, 3))]
+    angle, cross = qpos[..., None, None], np.cross(identity, arm.axis[:, None])  # cross @ x: product of axis and x
+    turns = identity + xp.sin(angle) * cross + (1 - xp.cos(angle)) * (cross @ cross)
+    steps = arm.anchor[..., None] - turns @ arm.anchor[..., None]
+    for joint, parent in enumerate(np.asarray(arm.parent).tolist()):
+        rotation = rotations[parent + 1]
+        shifts.append(shifts[parent + 1] + (rotation @ steps[..., joint, :, :])[..., 0])
+        rotations.append(rotation @ turns[..., joint, :, :])
+    body = arm.joint + 1
+    rotation, shift = xp.stack(rotations, axis=-3)[..., body, :, :], xp.stack(shifts, axis=-2)[..., body, :]
+    start, end = (xp.einsum("...cij,cj->...ci", rotation, points) + shift for points in (arm.start, arm.end))
+    return start, end
 
 
-def _sum(vectors: Array) -> Array:
-    """The sum over the three components, [..., 3, columns]."""
-    return vectors[..., 0, :] + vectors[..., 1, :] + vectors[..., 2, :]  # NumPy sums a short axis slowly
+def _segment_distances(a: Array, b: Array, c: Array, d: Array, xp: Any) -> Array:
+    """Distances [...] of the segments a-b and c-d, as `mimic.metric.capsule_distances.segment_distance`."""
+    u, v, w = b - a, d - c, a - c
+    uu, vv, uv, uw, vw = (_dot(x, y) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
+    determinant = uu * vv - uv * uv
+    is_parallel = determinant <= _PARALLEL * uu * vv
+    s = xp.where(is_parallel, 0.5, (uv * vw - vv * uw) / xp.where(is_parallel, 1, determinant))
+    s = xp.clip(s, 0, 1)
+    t = xp.clip((uv * s + vw) / xp.maximum(vv, _TINY), 0, 1)
+    s = xp.clip((uv * t - uw) / xp.maximum(uu, _TINY), 0, 1)
+    t = xp.clip((uv * s + vw) / xp.maximum(vv, _TINY), 0, 1)
+    difference = w + s[..., None] * u - t[..., None] * v
+    return xp.sqrt(_dot(difference, difference))
 
 
-def _fraction(x: Array, xp: Any) -> Array:
-    """The number in [0, 1] that is nearest."""
-    return xp.minimum(xp.maximum(x, 0.0), 1.0)
+def _dot(x: Array, y: Array) -> Array:
+    """The scalar products of vectors [..., 3]."""
+    return x[..., 0] * y[..., 0] + x[..., 1] * y[..., 1] + x[..., 2] * y[..., 2]  # NumPy sums a short axis slowly

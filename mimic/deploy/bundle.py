@@ -15,7 +15,7 @@ from mimic.control.clearance import ClearanceConstants
 from mimic.control.joint_control import MODES, PERIOD, JointParameters, action_size
 from mimic.control.limits import JointLimits
 
-FORMAT = 2
+FORMAT = 3
 POLICY, FEATURES = "policy.onnx", "features.onnx"
 CLEARANCE, CONTROLLER, MOTIONS = "clearance.npz", "controller.json", "motions.npz"
 _MODELS = POLICY, FEATURES, CLEARANCE
@@ -45,7 +45,7 @@ class Bundle:
       expert: [motions, ticks + 1, expert_numbers] the expert's link states at each tick.
       start_poses: [motions, joints] where each motion starts [rad].
       names: of the motions.
-      clearance: constants of the clearance of a pose.
+      clearance: the arm with its capsules.
     """
 
     folder: Path
@@ -215,7 +215,7 @@ def _parsed(
             expert=np.asarray(motions["expert"], np.float32),
             start_poses=np.asarray(motions["start_poses"], float),
             names=tuple(str(name) for name in motions["names"]),
-            clearance=ClearanceConstants(**{**clearance, "parent": clearance["parent"].tolist()}),
+            clearance=ClearanceConstants(**clearance),
         )
     except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise ValueError(
@@ -252,19 +252,22 @@ def _check(bundle: Bundle) -> None:
             raise ValueError(f"bundle: {name}: expected finite numbers")
 
 
-def _check_clearance(constants: ClearanceConstants, joints: int) -> None:
-    """Raises a `ValueError` where the constants are not those of an arm with this number of joints."""
-    pairs, points = constants.radii.size, constants.heights.size
-    columns = 4 * pairs + points
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(ClearanceConstants._fields, (pairs,))
-    shapes |= {"parent": (joints,), "constant": (16 * joints,), "factors": (2 * joints, 16 * joints)}
-    shapes |= {"moved": (4 * joints, columns), "fixed": (3, columns), "heights": (points,)}
-    for name, values in constants._asdict().items():
-        is_number = np.asarray(values).dtype.kind in "if"
-        if np.shape(values) != shapes[name] or not is_number or not np.all(np.isfinite(values)):
+def _check_clearance(arm: ClearanceConstants, joints: int) -> None:
+    """Raises a `ValueError` where it is not an arm with this number of joints and something to check."""
+    capsules, pairs, above = (np.asarray(x).shape[0] if np.ndim(x) else 0 for x in (arm.radius, arm.pairs, arm.above))
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("axis", "anchor"), (joints, 3))
+    shapes |= {"parent": (joints,), **dict.fromkeys(("start", "end"), (capsules, 3))}
+    shapes |= {"joint": (capsules,), "radius": (capsules,), "pairs": (pairs, 2), "above": (above,), "floor_height": ()}
+    maximum = {"parent": joints, "joint": joints, "pairs": capsules, "above": capsules}  # of indices
+    for name, values in arm._asdict().items():
+        is_number = values.dtype.kind == ("i" if name in maximum else "f")
+        if values.shape != shapes[name] or not is_number or not np.all(np.isfinite(values)):
             raise ValueError(
                 f"bundle: {CLEARANCE}: {name}: expected finite numbers of the shape {shapes[name]} of {joints} joints, "
-                f"got {np.shape(values)}"
+                f"got {values.shape}"
             )
-    if any(not -1 <= parent < joint for joint, parent in enumerate(constants.parent)) or not columns:
+        minimum = -1 if name in ("parent", "joint") else 0
+        if name in maximum and not np.all((values >= minimum) & (values < maximum[name])):
+            raise ValueError(f"bundle: {CLEARANCE}: {name}: expected indices from {minimum} to {maximum[name] - 1}")
+    if np.any(arm.parent >= np.arange(joints)) or not pairs + above:
         raise ValueError(f"bundle: {CLEARANCE}: expected parents before their children, and something to check")

@@ -72,7 +72,7 @@ BROKEN = {
     "no folder": (lambda folder: (folder / "policy.onnx").unlink(), "expected a folder of mimic.export"),
     "no JSON": (lambda folder: (folder / "controller.json").write_text("{"), "controller.json: expected JSON"),
     "no key": (lambda folder: (folder / "controller.json").write_text("{}"), "missing format, mimic_version"),
-    "another format": (lambda folder: changed(folder, format=1), "format: expected 2, got 1; export the run again"),
+    "another format": (lambda folder: changed(folder, format=1), "format: expected 3, got 1; export the run again"),
     "another network": (lambda folder: (folder / "policy.onnx").write_bytes(b"x"), "policy.onnx: expected the file"),
     "no motions": (lambda folder: (folder / "motions.npz").write_bytes(b"x"), "motions.npz: "),
     "a mode": (lambda folder: changed(folder, mode="flying"), "mode: expected one of torque, joint_position"),
