@@ -55,7 +55,7 @@ def find_chain(model: mujoco.MjModel, base: str | None = None, tip: Tip = None) 
     Args:
       model: any.
       base: name of the body that carries the arm; where None, the parent of the first body with a joint of the arm, or
-        the nearest common ancestor of several.
+        the nearest common ancestor of several; the body NAME for a NAME_inertia that is fixed to it.
       tip: name of the body or site at the end of the chain. Where None, the chain follows the longest branch, without
         grippers, heads and legs as far as names tell them, and up to the last tool that is named as one. It stops
         before a hand: branches that all have fewer revolute joints than the chain so far. A list of names gives a
@@ -81,7 +81,7 @@ def find_chain(model: mujoco.MjModel, base: str | None = None, tip: Tip = None) 
     ends = {int(model.jnt_bodyid[chain[-1]]) for chain in chains}
     distal = [j for j in others if j not in proximal and ends & set(ancestors(model, int(model.jnt_bodyid[j])))]
     rest = [joint for joint in others if joint not in proximal and joint not in distal]
-    base_body = start if base is not None else _common_parent(model, roots)
+    base_body = start if base is not None else _without_inertia(model, _common_parent(model, roots))
     return ChainIds(bodies, revolute, tuple(proximal), tuple(distal), tuple(rest), base_body, chains, tips, names)
 
 
@@ -107,6 +107,16 @@ def _all_ends(model: mujoco.MjModel, start: int) -> list[int]:
     moved = [body for body in range(1, model.nbody) if any(is_revolute(model, j) for j in joint_ids(model, body))]
     lines = {body: ancestors(model, body)[1:] for body in moved}
     return [b for b in moved if start in lines[b] and not any(b in lines[other] for other in moved)]
+
+
+def _without_inertia(model: mujoco.MjModel, body: int) -> int:
+    """The base, in place of the body that carries its inertia, which ROS's tools do not take in the root.
+
+    UR's base_link_inertia is rotated by pi in base_link, whose axes the users of these arms know.
+    """
+    parent = int(model.body_parentid[body])
+    is_copy = model.body(body).name == f"{model.body(parent).name}_inertia"
+    return parent if is_copy and not model.body_jntnum[body] else body
 
 
 def _common_parent(model: mujoco.MjModel, bodies: set[int]) -> int:

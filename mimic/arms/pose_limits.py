@@ -26,3 +26,13 @@ def continuous_joints(arm: Embodiment | ArmArrays) -> Bool[Any, " joints"]:
         return array_library(arm.home).isinf(arm.angle_limits[0])
     lower, upper = np.asarray(arm.joint_range).T
     return upper - lower >= 2 * np.pi - 1e-4  # models round pi in their text
+
+
+def motion_limits(arm: Embodiment) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper joint limits of motions [rad], infinite where the range is a full revolution and no more.
+
+    That is how models without limits are read. A joint with a wider range winds up.
+    """
+    lower, upper = np.asarray(arm.joint_range, float).T
+    endless = continuous_joints(arm) & (upper - lower < 2 * np.pi + 1e-4)
+    return np.where(endless, -np.inf, lower), np.where(endless, np.inf, upper)

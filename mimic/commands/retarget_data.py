@@ -25,6 +25,7 @@ from mimic.motions.rewriting import DataSet, read_data_set, write_data_set
 from mimic.retargeting.base_placement import find_base
 from mimic.retargeting.certificate import Certificate, certify
 from mimic.retargeting.motions import largest_jump, retarget_motion
+from mimic.retargeting.self_collision import make_contacts
 from mimic.runs.files import finite, written_atomically
 
 _REPORT, _PICTURE = "report.json", "certificate.png"
@@ -44,6 +45,7 @@ class _Setting(NamedTuple):
     seed: int
     costs: Any
     capsules: Capsules | None
+    contacts: Callable[..., Any] | None
 
 
 def prepare_data_set(config: RetargetConfig) -> Callable[[], int]:
@@ -65,7 +67,7 @@ def prepare_data_set(config: RetargetConfig) -> Callable[[], int]:
     dt = float(np.median(np.concatenate([np.diff(motion.time) for motion in data.measured.values()])))
     setting = _Setting(
         expert, learner, env.metric, config.hand, config.placement, dt, config.seed, config.costs,
-        _capsules(env.learner, env.limits),
+        *_shapes(env.learner, env.limits),
     )  # fmt: skip
 
     def run() -> int:
@@ -115,17 +117,17 @@ def retarget_episode(data: DataSet, name: str, setting: _Setting) -> tuple[dict[
         found[entry] = Motion(measured.time, qpos, qvel, measured.gripper)
     certificate = certify(
         setting.expert, setting.learner, measured.qpos, found[data.entry].qpos, jump,
-        base=setting.base, capsules=setting.capsules, demands_hand=setting.hand == "exact",
+        base=setting.base, capsules=setting.capsules, contacts=setting.contacts, demands_hand=setting.hand == "exact",
     )  # fmt: skip
     return found, certificate
 
 
-def _capsules(arm: ArmConfig, limits: str) -> Capsules | None:
-    """Capsules around the links of an arm; None where it has no shapes."""
+def _shapes(arm: ArmConfig, limits: str) -> tuple[Capsules, Callable[..., Any]] | tuple[None, None]:
+    """Capsules around the links of an arm, and what tells contacts; None where it has no shapes."""
     try:
-        return fit_capsules(arm, limits)
+        return fit_capsules(arm, limits), make_contacts(arm, limits)
     except ValueError:
-        return None
+        return None, None
 
 
 def _with_base(setting: _Setting, base: Any, data: DataSet, console: Console) -> _Setting:

@@ -10,11 +10,12 @@ from jaxtyping import Float
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints
 from mimic.metric.distance import NO_HAND, Correspondence, HandWeights, Metric, Reduction, RotationMeasure, Weights
+from mimic.metric.kinematics import hand_frames
 from mimic.retargeting.hand_target import POSITION_TOLERANCE, Placement, placement
 from mimic.retargeting.pose import checked_poses, imitate_pose
 from mimic.retargeting.trajectory import imitate_trajectory
 
-_FRAMES, _BASES, _ROUNDS = 16, 64, 3  # frames that judge a base, bases in each round of the search, and rounds
+_FRAMES, _BASES, _ROUNDS = 24, 64, 3  # frames that judge a base, bases in each round of the search, and rounds
 _SPREAD = np.array([0.5, 0.5, 0.2, np.pi])  # of the first round: chain lengths of the expert, and rad
 _NARROWER = 0.35  # factor of the spread from one round to the next
 _BEST = 4  # bases that the next round starts from, and that are checked on a whole motion at the end
@@ -59,8 +60,7 @@ def find_base(
     if not len(motions):
         raise ValueError("motions: expected at least one, got none")
     paths = [checked_poses(expert, np.asarray(motion, np.float32), "motions", axes=("time",)) for motion in motions]
-    frames = np.concatenate(paths)
-    frames = frames[np.linspace(0, len(frames) - 1, _FRAMES).round().astype(int)]
+    frames = spread_poses(expert, np.concatenate(paths), _FRAMES)
     metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
     bases = best_bases(expert, learner, frames, metric, seed=seed)
     longest, best, options = max(paths, key=len), (-1.0, bases[0]), {"hand": "exact", "largest_jump": largest_jump}
@@ -73,6 +73,22 @@ def find_base(
         if exact == 1:
             break
     return best[1]
+
+
+def spread_poses(
+    arm: Embodiment, qpos: Float[np.ndarray, "poses joints"], count: int
+) -> Float[np.ndarray, "count joints"]:
+    """The poses whose hands are farthest from each other, so that none is far from one of them.
+
+    Each next pose is the one with the greatest distance of its hand from those before, a metre counting as a radian.
+    """
+    hands = jax.device_get(jax.jit(jax.vmap(lambda pose: hand_frames(arm, pose)))(qpos))
+    places = np.concatenate([hands.position.reshape(len(qpos), -1), hands.rotation.reshape(len(qpos), -1) / 2], axis=1)
+    chosen, nearest = [0], np.full(len(qpos), np.inf)
+    while len(chosen) < count:
+        nearest = np.minimum(nearest, np.linalg.norm(places - places[chosen[-1]], axis=1))
+        chosen.append(int(nearest.argmax()))
+    return qpos[chosen]
 
 
 def best_bases(

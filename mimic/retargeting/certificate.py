@@ -1,7 +1,7 @@
 """What a learner's motion keeps of an expert's: the hand in metres, limits, speed and clearance; and what fails."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -11,13 +11,14 @@ from jaxtyping import Bool, Float
 
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import motion_limits
 from mimic.metric.kinematics import hand_frames
 from mimic.retargeting.clearance import make_clearance
 
 POSITION, ROTATION = 1e-3, np.radians(0.5)  # m, rad: a hand within both is where the expert's is
 _NO_FLOOR = -1e3  # m; what the arm stands on is not known
 _AT_LIMIT, _AT_RANGE = 0.999, 1e-3  # fraction of the velocity limit; rad from the end of a range
-_TOUCHING = -0.01  # m: capsules are larger than the shapes that they contain
+_TOUCHING = -0.01  # m, where contacts are not known: capsules are larger than the shapes that they contain
 _ROUNDING = 1e-5  # rad, relative: of single precision
 _CHUNK = 1024  # frames of a compiled function
 
@@ -85,6 +86,7 @@ def certify(
     *,
     base: Sequence[float] | None = None,
     capsules: Capsules | None = None,
+    contacts: Callable[[Float[np.ndarray, "frames joints"]], Bool[np.ndarray, " frames"]] | None = None,
     demands_hand: bool = True,
 ) -> Certificate:
     """Compares a motion of the learner with the expert's.
@@ -96,14 +98,19 @@ def certify(
       largest_jump: change of each joint at its velocity limit between two frames [rad].
       base: the learner's base in the expert's base frame, [x, y, z, yaw] [m, rad]; None for the same.
       capsules: of the learner, from `fit_capsules`, for the clearance.
+      contacts: from `make_contacts`, which decides where capsules touch.
       demands_hand: whether a frame fails whose hand is not where the expert's is.
     """
     position, rotation = hand_errors(expert, learner, expert_qpos, qpos, base)
-    lower, upper = np.asarray(learner.joint_range, float).T
+    lower, upper = motion_limits(learner)
     margins = np.minimum(qpos - lower, upper - qpos)
     steps = np.abs(np.diff(qpos, axis=0)) / largest_jump
     steps = np.concatenate([steps, np.zeros((1, qpos.shape[1]))])  # after the last frame the arm stands
     clearance = np.full(len(qpos), np.nan) if capsules is None else _clearance(learner, capsules, qpos)
+    touches = clearance < _TOUCHING
+    if contacts is not None:
+        touches = clearance < 0
+        touches[touches] = contacts(qpos[touches])
     is_exact = (position <= POSITION) & (rotation <= ROTATION)
     causes = []
     for frame in range(len(qpos)):
@@ -112,7 +119,7 @@ def certify(
             cause = f"{learner.joint_names[int(margins[frame].argmin())]} beyond its range"
         elif steps[frame].max() > 1 + _ROUNDING:
             cause = f"{learner.joint_names[int(steps[frame].argmax())]} beyond its velocity limit"
-        elif clearance[frame] < _TOUCHING:
+        elif touches[frame]:
             cause = "links touch"
         elif demands_hand and not is_exact[frame]:
             near = steps[max(frame - 1, 0) : frame + 1].max(axis=0)

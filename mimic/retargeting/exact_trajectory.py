@@ -3,13 +3,14 @@
 The branches of postures are searched at some times, the anchors, and tracked from each to its neighbours, forwards and
 backwards, within the velocity limits. So each time has a set of candidates. Dynamic programming finds the path through
 them that is exact as often as it can be, and then of least distance. Where this path changes branch faster than the
-velocity limits allow, the arm follows it as fast as it may, with an exact hand if it is redundant.
+velocity limits allow, the arm follows it as fast as it may, with an exact hand if it is redundant. The postures of a
+redundant arm are then smoothed over time, with the hand where it is.
 
 JAX computes chunks of a fixed number of times, so that motions of all lengths share its compiled functions.
 """
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -19,18 +20,19 @@ from jaxtyping import Array, Float
 
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
-from mimic.arms.pose_limits import continuous_joints, pose_limits
+from mimic.arms.pose_limits import continuous_joints, motion_limits, pose_limits
 from mimic.base.compilation import compiled_once
 from mimic.metric.distance import Metric
 from mimic.retargeting.costs import NO_COSTS, Costs
+from mimic.retargeting.exact_chunks import CHUNK, by_chunks, hand_report, in_chunks
 from mimic.retargeting.exact_pose import DESCENTS, FINE, ExactTargets, exact_solver
 from mimic.retargeting.hand_target import HandError, Placement, hand_cost_derivatives, is_exact
 from mimic.retargeting.initial_guesses import RandomPoses
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, newton
+from mimic.retargeting.path_smoothing import smoothed
 from mimic.retargeting.pose import PoseImitation, shared_joints, wrap_angles
 
-SPACING, SEGMENTS = 16, 16  # times from one anchor to the next, and such segments in a chunk
-CHUNK = SPACING * SEGMENTS
+SPACING, SEGMENTS = 16, CHUNK // 16  # times from one anchor to the next, and such segments in a chunk
 _BRANCHES = 9  # at each anchor
 _STEPS, _DAMPING = 4, 1e-3  # Newton's method from the neighbouring time
 _SLACK = 0.95  # of the maximum change for candidates, which are finished afterwards
@@ -71,42 +73,27 @@ def exact_trajectory(
     chunks = [tracked(x, base, random, jump) for x in in_chunks(poses, CHUNK + 1, 1)]
     candidates = Candidates(*(np.concatenate(jax.device_get(part))[:times] for part in zip(*chunks, strict=True)))
     continuous, ranges = continuous_joints(learner), np.asarray(learner.joint_range)
-    report = _report(*arms)
+    report = hand_report(*arms)
+
+    # Whether a redundant arm stays exact on the way to another branch is only known when it goes there.
+    is_redundant = learner.num_joints > 6 * len(learner.hand_joint)
 
     def realized(cost_of_step: float) -> tuple[np.ndarray, ...]:
         """Angles, distances and errors of the hand on the best path, as fast as it can be followed."""
         qpos = within_ranges(best_path(candidates, jump, continuous, cost_of_step), ranges)
         if np.any(np.abs(np.diff(qpos, axis=0)) > jump):
             qpos = _followed(arms, poses, qpos, base, jump)
-        return qpos, *_by_chunks(lambda x, qpos: report(x, base, qpos), poses, qpos)
+        if is_redundant:
+            qpos = smoothed(arms, poses, qpos, base, jump)
+        return qpos, *by_chunks(lambda x, qpos: report(x, base, qpos), poses, qpos)
 
-    # Whether a redundant arm stays exact on the way to another branch is only known when it goes there.
-    is_redundant = learner.num_joints > 6 * len(learner.hand_joint)
     paths = [realized(cost) for cost in ((_PER_STEP, _INEXACT) if is_redundant else (_INEXACT,))]
     qpos, distance, position, rotation = max(paths, key=lambda path: (is_exact(*path[2:]).sum(), -path[1].mean()))
-    lower, upper = ranges.T
-    endless = upper - lower < 2 * np.pi + 1e-4  # of a full revolution and no more: without limits
-    inside = (qpos >= lower - 1e-6) & (qpos <= upper + 1e-6) | (continuous & endless)
+    lower, upper = motion_limits(learner)
+    inside = (qpos >= lower - 1e-6) & (qpos <= upper + 1e-6)
     qpos, distance, position, rotation = map(jnp.asarray, (qpos, distance, position, rotation))
     exact = is_exact(position, rotation) & inside.all(axis=-1)
     return PoseImitation(qpos, distance, exact, HandError(position, rotation, exact))
-
-
-def in_chunks(rows: np.ndarray, size: int, overlap: int = 0) -> Iterator[np.ndarray]:
-    """The rows in chunks of one size, each with the first rows of the next; the last one is padded with its last row.
-
-    Each row is among the first `size - overlap` of a chunk.
-    """
-    for start in range(0, len(rows), size - overlap):
-        chunk = rows[start : start + size]
-        yield np.concatenate([chunk, np.repeat(chunk[-1:], size - len(chunk), axis=0)])
-
-
-def _by_chunks(function: Callable[..., Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-    """A function of chunks of rows, for all rows."""
-    chunks = zip(*(in_chunks(array, CHUNK) for array in arrays), strict=True)
-    results = [function(*chunk) for chunk in chunks]
-    return tuple(np.concatenate(jax.device_get(part))[: len(arrays[0])] for part in zip(*results, strict=True))
 
 
 @compiled_once
@@ -185,20 +172,6 @@ def within_ranges(
     middle = (path.min(axis=0) + path.max(axis=0)) / 2
     revolutions = np.round((middle - ranges.mean(axis=1)) / (2 * np.pi))
     return path - 2 * np.pi * np.where(np.ptp(ranges, axis=1) >= 2 * np.pi - 1e-4, revolutions, 0)
-
-
-@compiled_once
-def _report(*arms: Any) -> Callable[..., tuple[Array, Array, Array]]:
-    """The function from CHUNK poses, a placement and angles to distances and errors of the hand [m, rad]."""
-    solver = exact_solver(*arms)
-
-    def report(poses: Array, base: Placement, qpos: Array) -> tuple[Array, Array, Array]:
-        targets, states = solver.targets(base, poses)
-        lanes = qpos.astype(poses.dtype).T[:, None]
-        position, rotation = solver.errors(targets, lanes)
-        return solver.distances(states, lanes)[0], position[0], rotation[0]
-
-    return report
 
 
 def _followed(

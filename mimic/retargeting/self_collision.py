@@ -1,12 +1,17 @@
 """Motions in which links touch each other or the floor."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from mimic.arms.arm import ArmConfig, arm_spec, build_arm
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.mujoco_chain import data_at_zero
 from mimic.retargeting.clearance import make_clearance
 
 
@@ -24,6 +29,33 @@ def smallest_clearances(
     """
     clearance = jax.jit(jax.vmap(make_clearance(arm, capsules, floor_height)))
     return np.stack([np.asarray(clearance(jnp.asarray(motion, jnp.float32))).min() for motion in qpos])
+
+
+def make_contacts(
+    config: ArmConfig, limits: str = "none"
+) -> Callable[[Float[np.ndarray, "poses joints"]], Bool[np.ndarray, " poses"]]:
+    """Makes the function from joint angles [rad] to whether collision geoms of the arm's model touch, by MuJoCo.
+
+    Meshes count as their convex hulls. Bodies that are joined, and those that touch in the home pose, are left out.
+
+    Raises:
+      ValueError: what `build_arm` rejects.
+    """
+    arm, model = build_arm(config, limits), arm_spec(config).compile()
+    data = data_at_zero(model)
+    for name, angle in arm.locked.items():
+        data.qpos[model.joint(name).qposadr[0]] = angle
+    address = np.array([model.joint(name).qposadr[0] for name in arm.embodiment.joint_names])
+
+    def touching(qpos: np.ndarray) -> set[tuple[int, int]]:
+        data.qpos[address] = qpos
+        mujoco.mj_fwdPosition(model, data)
+        pairs = model.geom_bodyid[np.array([contact.geom for contact in data.contact], int).reshape(-1, 2)]
+        depths = [contact.dist for contact in data.contact]
+        return {(int(a), int(b)) for (a, b), depth in zip(pairs, depths, strict=True) if depth < 0}
+
+    always = touching(np.asarray(arm.embodiment.home, float))
+    return lambda qpos: np.array([bool(touching(pose) - always) for pose in qpos], bool)
 
 
 def touching_line(clearances: Float[np.ndarray, " motions"], noun: str = "demonstrations") -> str:

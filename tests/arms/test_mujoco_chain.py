@@ -81,6 +81,16 @@ def on_a_base(offset, axis="0 0 1"):
     return model(f'<body name="plate" pos="2 3 0.5" euler="0 0 1">{arm}</body>')
 
 
+@pytest.mark.parametrize(("name", "x"), [("base_link", -1), ("mount", 1)])
+def test_the_base_is_the_body_whose_inertia_another_one_carries(name, x):
+    """UR's base_link_inertia is turned by half a revolution in base_link; in other bodies such a name says nothing."""
+    arm = revolute("a", body="A", inner=revolute("b", pos="1 0 0", body="B", inner=TIP))
+    turned = f'<body name="base_link_inertia" quat="0 0 0 1">{arm}</body>'
+    found = load_mjcf(model(f'<body name="{name}">{turned}</body>'))
+    np.testing.assert_allclose(found.joint_anchor[1], [x, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(found.segment_end[-1], [1.5 * x, 0, 0], atol=1e-12)
+
+
 def test_the_first_link_starts_at_the_base():
     arm = load_mjcf(on_a_base("0 0 0.3"))
     assert (arm.link_names, arm.num_joints) == (("base", "link1", "link2"), 2)

@@ -38,6 +38,16 @@ def test_the_hand_errors_are_those_of_a_rotation_of_the_last_joint():
     assert causes(turned, demands_hand=False) == ("",) * 20
 
 
+@pytest.mark.parametrize(("half", "is_ok"), [(np.pi, True), (3.1, False)])
+def test_a_range_of_one_revolution_is_no_limit(half, is_ok):
+    """A joint without limits has it, and may go on."""
+    ranges = np.tile([[-np.pi, np.pi]], (7, 1))
+    ranges[6] = [-half, half]
+    qpos = QPOS + np.array([0, 0, 0, 0, 0, 0, 2.5])
+    arm = dataclasses.replace(ARM, joint_range=ranges)
+    assert certify(arm, arm, qpos, qpos, JUMP).is_ok == is_ok
+
+
 def test_a_base_is_where_the_learner_stands():
     base = [0.3, -0.1, 0.2, 0.7]
     turn = np.array([[np.cos(0.7), -np.sin(0.7), 0], [np.sin(0.7), np.cos(0.7), 0], [0, 0, 1]])

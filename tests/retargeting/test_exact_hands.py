@@ -12,7 +12,8 @@ from mimic.metric.config import MetricConfig
 from mimic.metric.distance import embodiment_distance
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.base_placement import find_base
-from mimic.retargeting.exact_trajectory import Candidates, best_path, in_chunks, within_ranges
+from mimic.retargeting.exact_chunks import in_chunks
+from mimic.retargeting.exact_trajectory import Candidates, best_path, within_ranges
 from mimic.retargeting.hand_target import (
     POSITION_TOLERANCE,
     ROTATION_TOLERANCE,

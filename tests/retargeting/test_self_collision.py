@@ -9,7 +9,7 @@ from mimic.arms.capsules import fit_capsules
 from mimic.metric.capsule_distances import colliding_pairs
 from mimic.physics.mujoco_world import FLOOR, mujoco_world
 from mimic.physics.world import WorldConfig
-from mimic.retargeting.self_collision import smallest_clearances, touching_line
+from mimic.retargeting.self_collision import make_contacts, smallest_clearances, touching_line
 
 POSES = 400
 
@@ -34,6 +34,19 @@ def test_clearances_are_the_distances_of_mujocos_contacts(locked):
     assert 20 < (expected < 0).sum() < POSES - 20
     np.testing.assert_allclose(actual[expected > -0.02], expected[expected > -0.02], atol=2e-4)  # 0.1 mm: smoothing
     assert np.all(actual[expected < -0.02] < 0)  # deep inside, the direction of a contact is arbitrary
+
+
+def test_contacts_are_those_of_the_models_own_shapes(tmp_path):
+    """Three boxes, of which the first and the third meet where the second joint folds the arm."""
+    box = '<geom type="box" pos="0.5 0 0" size="0.45 0.1 0.1"/>'
+    inner = f'<body name="c" pos="1 0 0"><joint name="c" axis="0 0 1"/>{box}</body>'
+    middle = f'<body name="b" pos="1 0 0"><joint name="b" axis="0 0 1"/>{box}{inner}</body>'
+    arm = f'<body name="a"><joint name="a" axis="0 0 1"/>{box}{middle}</body>'
+    xml = f'<mujoco><compiler angle="radian"/><worldbody>{arm}</worldbody></mujoco>'
+    (tmp_path / "arm.xml").write_text(xml)
+    contacts = make_contacts(ArmConfig(model=str(tmp_path / "arm.xml")))
+    folded, passing = [0.0, 2.0, 2.3], [0.0, np.pi / 2, np.pi / 2]  # the third box lies across the first, or beside it
+    assert contacts(np.array([[0.0, 0.0, 0.0], folded, passing])).tolist() == [False, True, False]
 
 
 def _counts(model, contact, pairs) -> bool:

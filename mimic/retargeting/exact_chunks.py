@@ -1,0 +1,45 @@
+"""Functions of a fixed number of times, so that motions of all lengths share what is compiled."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+
+from mimic.base.compilation import compiled_once
+from mimic.retargeting.exact_pose import exact_solver
+from mimic.retargeting.hand_target import Placement
+
+CHUNK = 256  # times
+
+
+def in_chunks(rows: np.ndarray, size: int, overlap: int = 0) -> Iterator[np.ndarray]:
+    """The rows in chunks of one size, each with the first rows of the next; the last one is padded with its last row.
+
+    Each row is among the first `size - overlap` of a chunk.
+    """
+    for start in range(0, len(rows), size - overlap):
+        chunk = rows[start : start + size]
+        yield np.concatenate([chunk, np.repeat(chunk[-1:], size - len(chunk), axis=0)])
+
+
+def by_chunks(function: Callable[..., Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """A function of chunks of rows, for all rows."""
+    chunks = zip(*(in_chunks(array, CHUNK) for array in arrays), strict=True)
+    results = [function(*chunk) for chunk in chunks]
+    return tuple(np.concatenate(jax.device_get(part))[: len(arrays[0])] for part in zip(*results, strict=True))
+
+
+@compiled_once
+def hand_report(*arms: Any) -> Callable[..., tuple[Array, Array, Array]]:
+    """The function from CHUNK poses, a placement and angles to distances and errors of the hand [m, rad]."""
+    solver = exact_solver(*arms)
+
+    def report(poses: Array, base: Placement, qpos: Array) -> tuple[Array, Array, Array]:
+        targets, states = solver.targets(base, poses)
+        lanes = qpos.astype(poses.dtype).T[:, None]
+        position, rotation = solver.errors(targets, lanes)
+        return solver.distances(states, lanes)[0], position[0], rotation[0]
+
+    return report
