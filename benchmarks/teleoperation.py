@@ -294,8 +294,8 @@ def times(options: argparse.Namespace) -> Iterator[Row]:
     operator = mimic.Teleoperator(leader, follower, base=BASE, velocity=SPEED["piper"], rate=_RATE)
     methods: dict[str, Callable[[], tuple[np.ndarray, np.ndarray]]] = {
         "mimic": lambda: driven(operator, qpos)[:2],
-        "ssik's Tracker": lambda: tracked_by_ssik(follower, targets, operator.step(None).qpos),
         "mink": lambda: tracked_by_mink(follower, targets, operator.step(None).qpos),
+        "ssik's Tracker": lambda: tracked_by_ssik(follower, targets, operator.step(None).qpos),
     }
     for method, run in methods.items():
         core = 1e6 * core_seconds()
