@@ -79,6 +79,8 @@ def cleaned(
 def _finite(name: str, motion: Motion, notes: Notes) -> Motion:
     """The samples whose time and angles are numbers; without velocities where some are none."""
     kept = np.isfinite(motion.time) & np.all(np.isfinite(motion.qpos), axis=1)
+    if not kept.any():
+        raise ValueError(f"source: {name} has no sample whose time and angles are numbers")
     if not kept.all():
         notes.add("samples without numbers left out", f"{np.sum(~kept)} of {len(kept)} in {name}")
         motion = motion.take(kept)

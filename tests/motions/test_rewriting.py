@@ -255,3 +255,25 @@ def test_an_episode_that_needs_repair_is_a_fault(tmp_path):
     data = read_data_set(tmp_path / "m.csv", EXPERT)
     assert list(data.measured) == ["demonstration 0"]
     assert "jumps" in data.faults["demonstration 1"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda state: state * np.nan, "no sample whose time and angles are numbers"),
+        (lambda state: state[:, :3], "expected .* numbers or more in a frame"),
+        (lambda state: state[:, :2], "numbers"),
+    ],
+)
+def test_columns_of_a_data_set_that_are_no_angles_are_an_error(tmp_path, change, message):
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    lerobot(tmp_path / "set", "v3.0")
+    (file,) = (tmp_path / "set/data").rglob("*.parquet")
+    table = pq.read_table(file)
+    state = change(np.array(table["observation.state"].to_pylist()))
+    column = pa.array(state.tolist(), pa.list_(pa.float32()))
+    pq.write_table(
+        table.set_column(table.schema.get_field_index("observation.state"), "observation.state", column), file
+    )
+    with pytest.raises(ValueError, match=message):
+        read_data_set(tmp_path / "set", EXPERT, units="deg")

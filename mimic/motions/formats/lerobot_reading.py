@@ -131,7 +131,14 @@ def feature_names(form: Mapping[str, Any]) -> list[str]:
 
 def _select(samples: np.ndarray, columns: Mapping[str, int], joints: Sequence[str]) -> np.ndarray | None:
     """The columns of joints; None where one has no such column."""
-    return samples[:, [columns[joint] for joint in joints]] if set(joints) <= set(columns) else None
+    if not set(joints) <= set(columns):
+        return None
+    chosen = [columns[joint] for joint in joints]
+    if max(chosen) >= samples.shape[1]:
+        raise ValueError(
+            f"source: expected {max(chosen) + 1} numbers or more in a frame, as {INFO} says, got {samples.shape[1]}"
+        )
+    return samples[:, chosen]
 
 
 def _times(frame: np.ndarray, timestamp: np.ndarray, fps: float) -> tuple[np.ndarray, str]:
