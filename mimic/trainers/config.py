@@ -26,6 +26,9 @@ def _unset() -> Any:
 
 
 NETWORKS = ("mlp", "joints")
+LOOPS = ("mimic", "brax")
+# Settings that brax's loop lacks, with the values by which ours has none of them either.
+_WITHOUT_SCHEDULES = {"final_learning_rate": 1.0, "final_entropy_cost": 1.0, "timed_critic": False}
 LOGGERS = ("local", "wandb", "mlflow")
 
 # Factor on the number of evaluations with a target gap, so that training ends soon after the gap is reached: an
@@ -77,6 +80,8 @@ class PPOConfig(TrainerConfig):
       name: "ppo".
       preset: "cpu" or "gpu"; where the learner is drawn for each episode "any_arm_cpu" or "any_arm"; with an inner loop
         (`env.control`, `world`) "inner_loop_cpu" or "inner_loop"; or "auto", which follows JAX's backend.
+      loop: "mimic"; or "brax", brax's own training loop (`trainer=brax`), without schedules, `timed_critic` and
+        `resume=`.
       num_timesteps: environment steps of the training, rounded up to whole training epochs; a training epoch is the
         training between two evaluations.
       num_envs: number of arms that are simulated in parallel.
@@ -110,6 +115,7 @@ class PPOConfig(TrainerConfig):
 
     name: str = "ppo"
     preset: str = "auto"
+    loop: str = "mimic"
     num_timesteps: FromPreset[int] = number(None, at_least=1, at_most=10**12)  # a week on eight GPUs
     num_envs: FromPreset[int] = number(None, at_least=1, at_most=2**22)
     unroll_length: FromPreset[int] = number(None, at_least=1, at_most=10_000)
@@ -136,6 +142,7 @@ class PPOConfig(TrainerConfig):
     def __post_init__(self) -> None:
         check_choice("trainer.preset", self.preset, ("auto", *PPO_PRESETS))
         check_choice("trainer.name", self.name, ("ppo",))
+        check_choice("trainer.loop", self.loop, LOOPS)
         if self.network is not None:
             check_choice("trainer.network", self.network, NETWORKS)
         check_ranges(self, "trainer.")
@@ -169,6 +176,9 @@ class PPOConfig(TrainerConfig):
                 raise ValueError(
                     f"trainer.{key}: expected a multiple of the {devices} devices, got {getattr(self, key)}"
                 )
+        for key, value in _WITHOUT_SCHEDULES.items() if self.loop == "brax" else ():
+            if getattr(self, key) != value:
+                raise ValueError(f"trainer.{key}: expected {value} with brax's loop, got {getattr(self, key)}")
 
     @property
     def total_steps(self) -> int:

@@ -39,6 +39,11 @@ def test_the_network_of_joints_needs_a_drawn_learner():
 
 
 BAD = {
+    "loop": (lambda: PPOConfig(loop="x"), "trainer.loop: expected one of mimic, brax, got 'x'"),
+    "schedule": (
+        lambda: PPOConfig(loop="brax").resolve("gpu"),
+        "trainer.final_learning_rate: expected 1.0 with brax's loop, got 0.01",
+    ),
     "num_envs": (lambda: PPOConfig(num_envs=500).resolve("cpu"), "must be a multiple of num_envs = 500"),
     "learning_rate": (
         lambda: PPOConfig(learning_rate=math.inf),

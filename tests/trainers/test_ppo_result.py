@@ -7,11 +7,14 @@ import jax
 import numpy as np
 import pytest
 
-from mimic.runs.checkpoints import Checkpoint
+import mimic
+from mimic.runs.checkpoints import Checkpoint, checkpoint_steps
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo import ppo
+from mimic.trainers.ppo import brax_loop, ppo
 from mimic.trainers.ppo.trainer import PPOTrainer
+
+WITHOUT_SCHEDULES: dict[str, Any] = {"final_learning_rate": 1.0, "final_entropy_cost": 1.0, "timed_critic": False}
 
 
 def run(monkeypatch, run_dir, values, last=None):
@@ -52,3 +55,40 @@ def test_a_target_that_is_reached_ends_the_training_with_the_checkpoint_that_rea
 def test_the_target_is_the_gap_of_the_training_demonstrations(train, held_out, is_good):
     trainer: Any = SimpleNamespace(settings=PPOConfig(target_gap=0.1))
     assert PPOTrainer.good_enough(trainer, {"optimality_gap": {"train": train, "held_out": held_out}}) == is_good
+
+
+@pytest.mark.parametrize(("last", "expected"), [(None, (30, 3.0, [0, 10, 20, 30])), (20, (20, 2.0, [0, 10, 20]))])
+def test_the_checkpoints_of_braxs_loop_are_evaluated_and_saved_in_order(monkeypatch, tmp_path, last, expected):
+    def loop(*, policy_params_fn, progress_fn, num_evals, **_):
+        policy_params_fn(0, None, {"x": np.array([0.0])})
+        for epoch in range(1, num_evals):
+            policy_params_fn(10 * epoch, None, {"x": np.array([float(epoch)])})
+            progress_fn(10 * epoch, {"training/sps": 5.0, "training/v_loss": 1.0})
+
+    monkeypatch.setattr(brax_loop.brax_ppo, "train", loop)
+    evaluated, config = [], PPOConfig(loop="brax", evaluations=3, **WITHOUT_SCHEDULES).resolve("cpu")
+    env: Any = SimpleNamespace(config=SimpleNamespace(horizon=5))
+
+    def on_evaluation(step, _params, metrics):
+        evaluated.append(step)
+        assert metrics == ({"sps": 5.0, "v_loss": 1.0} if step else {})
+        return step == last
+
+    arguments: dict[str, Any] = {"seed": 0, "on_evaluation": on_evaluation, "signals": Signals()}
+    step, params = brax_loop.train(env, config, tmp_path, **arguments)
+    assert (step, float(params["x"][0]), evaluated) == expected
+    assert checkpoint_steps(tmp_path)[-1] == step
+    with pytest.raises(ValueError, match=r"resume: .* got one of brax's loop at step 30"):
+        brax_loop.train(env, config, tmp_path, **arguments, restored=Checkpoint(30, params, None, {}))
+
+
+@pytest.mark.slow
+def test_braxs_loop_trains_on_the_same_environment(tmp_path):
+    """Parameters of the same structure as those of mimic's loop, with a policy that is better than an untrained one."""
+    few = {"num_timesteps": 40_000, "num_envs": 64, "batch_size": 32, "num_minibatches": 8, "crossovers": 0}
+    trainer = {**few, **WITHOUT_SCHEDULES, "loop": "brax", "evaluations": 2, "unroll_length": 10}
+    model = mimic.fit(
+        "planar4dof", trainer=trainer, demonstrations={"count": 5, "held_out": 2}, run_dir=str(tmp_path / "run")
+    )
+    assert model.report["env_steps"] >= 40_000 and np.isfinite(model.report["optimality_gap"]["train"])
+    assert model.report["steps_per_second"] > 0

@@ -22,7 +22,7 @@ from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.ppo import ppo, report_rows
+from mimic.trainers.ppo import brax_loop, ppo, report_rows
 from mimic.trainers.trainer import Metrics, OnEvaluation, Params, Row, Trainer
 
 EVALUATED_DEMONSTRATIONS = 8  # of the held-out ones, by each of many arms: with 29 arms, 232 rollouts and bounds
@@ -160,7 +160,8 @@ class PPOTrainer(Trainer):
                 self._rollouts_on_mjx.start()  # not earlier: it would delay the functions of the training
             return stop
 
-        return ppo.train(
+        train = ppo.train if self.settings.loop == "mimic" else brax_loop.train
+        return train(
             self._env,
             self.settings,
             run_dir,
@@ -173,6 +174,8 @@ class PPOTrainer(Trainer):
 
     def follow(self, restored: Checkpoint | None) -> None:
         """See `ppo.train`."""
+        if self.settings.loop != "mimic":
+            raise ValueError("distributed: expected trainer.loop=mimic, as brax's loop trains in one process here")
         ppo.follow(self._env, self.settings, seed=self._seed, restored=restored)
 
     def evaluate(self, params: Params) -> Rollouts:
