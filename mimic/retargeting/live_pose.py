@@ -106,7 +106,7 @@ class ArmRows:
 
 
 _IDENTITY = np.eye(4)
-_LEVI_CIVITA = -np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshape(3, 9) * -1.0
+_LEVI_CIVITA = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshape(3, 9)
 
 
 def _hands(arm: Embodiment) -> tuple[np.ndarray, np.ndarray, list[int]]:

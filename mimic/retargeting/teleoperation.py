@@ -34,6 +34,8 @@ _AHEAD = 0.05  # s, the shortest of the trajectories of which a tick takes the b
 _BRAKING = 0.5  # of twice the acceleration: what a joint needs to stop before its limit
 _GRIPPER_TIME = 0.25  # s at least from closed to open
 _LANES, _ROUNDS = 12, 25  # postures of a search for another branch, and ticks that it takes
+_SEARCHES = 2  # before an approach: the branch that is chosen there stays
+_ROOM = 3e-8  # weight there of the mean squared distance from the middle of the joints' ranges, in half ranges
 _STUCK = 0.3  # s with a hand that is not reached, after which another branch is searched
 _LINE, _DETOUR = 16, 1.1  # points of a straight way to another branch; it may increase the hand's cost so much
 
@@ -236,17 +238,27 @@ class Teleoperator:
                 return
             if not self._is_near and self._rounds:
                 return  # on its way
-            low, high = np.maximum(self._lower, -np.pi), np.minimum(self._upper, np.pi)
-            self._lanes, self._rounds = self._random.uniform(low, high, (_LANES, len(low))), 0
-            self._lanes[0] = self._posture
+            self._lanes, self._rounds = self._spread(self._posture), 0
         box = np.maximum(self._lower, self._lanes - 0.5), np.minimum(self._upper, self._lanes + 0.5)
         self._lanes, cost = self._pose.step(goal, self._lanes, *box, FAR)
         self._rounds += 1
-        if self._rounds < _ROUNDS:
+        if self._rounds % _ROUNDS:
             return
-        best, self._lanes, self._stuck = self._lanes[cost.argmin()], None, 0.0
+        if not self._is_near:  # a wrist that is flipped is as near to the leader, but may soon be at a limit
+            low, high = self._lower, self._upper
+            cost = cost + _ROOM * np.mean(((2 * self._lanes - low - high) / (high - low)) ** 2, axis=1)
+        best = self._lanes[cost.argmin()]
+        if not self._is_near and self._rounds < _SEARCHES * _ROUNDS:
+            self._lanes = self._spread(best)
+            return
+        self._lanes, self._stuck = None, 0.0
         if not self._is_near or self._leads_there(goal, best, float(cost.min())):
             self._posture, self._posture_rows, self._is_near = best, None, False
+
+    def _spread(self, posture: np.ndarray) -> np.ndarray:
+        """Random postures [lanes, joints], of which the first is this one."""
+        low, high = np.maximum(self._lower, -np.pi), np.minimum(self._upper, np.pi)
+        return np.concatenate([posture[None], self._random.uniform(low, high, (_LANES - 1, len(low)))])
 
     def _leads_there(self, goal: Goal, posture: np.ndarray, cost: float) -> bool:
         """Whether another branch is better, and the hand does not go away from its goal on the straight way there."""

@@ -104,7 +104,7 @@ def test_a_plugin_is_imported_and_named_for_other_processes(module, own_registry
         (["--plugin"], "--plugin: expected a module"),
         (["--plugin", "no_such_module"], "--plugin no_such_module failed: ModuleNotFoundError"),
         (["env=no_such_env"], "unknown env 'no_such_env'; valid are any_arm, bimanual, pair, panda3dof"),
-        (["trainer=no_such_trainer"], "unknown trainer 'no_such_trainer'; valid are pose_mapper, ppo"),
+        (["trainer=no_such_trainer"], "unknown trainer 'no_such_trainer'; valid are brax, pose_mapper, ppo"),
     ],
 )
 def test_a_bad_name_is_one_line(rejected, arguments, message):

@@ -160,8 +160,8 @@ def test_a_checkpoint_of_another_environment(reason, run_dir, tmp_path):
     shutil.rmtree(other / "checkpoints")
     shutil.copytree(run_dir / "checkpoints", other / "checkpoints")
     error = reason("evaluate", f"run={other}", "compilation_cache=")
-    # 12 numbers for each link seen: 3 of the learner and twice 3 of the expert, where the other learner has 2.
-    assert "does not fit the config of its run" in error and "expected shape (153,), got shape (141,)" in error
+    # The other learner has a link more, of 12 numbers, and a joint more, of 3.
+    assert "does not fit the config of its run" in error and "expected shape (135,), got shape (120,)" in error
 
 
 def test_a_mapper_has_no_controllers(reason, tmp_path):

@@ -163,5 +163,5 @@ def test_hand_costs_of_both_hands(x64, body):
     moved = np.stack([qpos] * 3)  # not at all, the left hand, and both
     moved[1:, body.joint_names.index("left_joint2")] += 0.3
     moved[2, body.joint_names.index("right_joint2")] += 0.3
-    none, left, both = jax.jit(jax.vmap(lambda q: hand_cost(body, body, qpos, q, 1.0, 1.0)))(moved)
-    assert abs(none) < 1e-12 < 1e-3 < left < both
+    none, left, both = jax.jit(jax.vmap(lambda q: hand_cost(body, body, qpos, q)))(moved)
+    assert abs(none) < 1e-12 < 1e-6 < left < both
