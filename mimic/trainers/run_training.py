@@ -33,7 +33,7 @@ from mimic.runs.metrics_log import MetricsLog
 from mimic.runs.provenance import hardware
 from mimic.runs.signals import Interrupted, Signals, noted_signals
 from mimic.runs.stopwatch import Stopwatch
-from mimic.trainers.config import TrainConfig
+from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer
 from mimic.trainers.progress import TrainingProgress
 from mimic.trainers.report import make_report, show_report
@@ -79,8 +79,15 @@ def prepare_training(
     if resumed_dir:
         config = _resumed_config(resumed_dir, config, overrides)
         check_writable("resume", resumed_dir)
-    if group and config.trainer.name != "ppo":
-        raise ValueError(f"distributed: expected trainer=ppo, got {config.trainer.name}, which trains in one process")
+    is_braxs = isinstance(config.trainer, PPOConfig) and config.trainer.loop == "brax"
+    if resumed_dir and is_braxs:
+        raise ValueError(
+            "resume: expected a run of trainer.loop=mimic, got one of brax's loop, which saves no training state; "
+            "init=RUN starts from its policy"
+        )
+    if group and (is_braxs or config.trainer.name != "ppo"):
+        name = "brax" if is_braxs else config.trainer.name
+        raise ValueError(f"distributed: expected trainer=ppo, got {name}, which trains in one process")
     is_first = group is None or group.first
     if not resumed_dir:
         config.check_used()

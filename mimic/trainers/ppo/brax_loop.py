@@ -42,14 +42,8 @@ def train(
 ) -> tuple[int, Params]:
     """Trains a policy by `brax.training.agents.ppo.train.train`. See `ppo.train`, also for the arguments.
 
-    Raises:
-      ValueError: a checkpoint to continue from after step 0: brax does not save the state of a training.
+    Of a restored checkpoint, brax takes the parameters alone.
     """
-    if restored is not None and restored.step:
-        raise ValueError(
-            f"resume: expected a run of trainer.loop=mimic, got one of brax's loop at step {restored.step:,}, which "
-            "saves no training state; init=RUN starts from its policy"
-        )
     compat.mend_brax()
     on_compiling()
     checkpoints: list[Checkpoint] = []

@@ -174,8 +174,6 @@ class PPOTrainer(Trainer):
 
     def follow(self, restored: Checkpoint | None) -> None:
         """See `ppo.train`."""
-        if self.settings.loop != "mimic":
-            raise ValueError("distributed: expected trainer.loop=mimic, as brax's loop trains in one process here")
         ppo.follow(self._env, self.settings, seed=self._seed, restored=restored)
 
     def evaluate(self, params: Params) -> Rollouts:
