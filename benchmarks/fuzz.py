@@ -38,7 +38,6 @@ from mimic.arms.model_files import read_model
 from mimic.base.config import flatten, to_dict
 from mimic.commands import cli
 from mimic.commands.collect.finished_runs import find_runs
-from mimic.metric.correspondence_files import load_correspondence
 from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.lerobot_reading import read_lerobot
 from mimic.motions.formats.rosbag2 import read_rosbag2
@@ -68,7 +67,7 @@ def read_motions(folder: Path, changed: Path) -> Any:
         return read_rosbag2(folder / "bags", episodes.EXPERT)
     if changed.stem == "imported":
         return vars(import_demonstrations(changed, ARM)[0])
-    return vars(load_demonstrations(changed)) if changed.suffix == ".npz" else load_correspondence(changed, ARM, ARM)
+    return vars(load_demonstrations(changed))
 
 
 def read_models(folder: Path, changed: Path) -> Any:

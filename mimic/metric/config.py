@@ -21,7 +21,6 @@ from mimic.metric.correspondence import (
     overlap_correspondence,
     soft_correspondence,
 )
-from mimic.metric.correspondence_files import checked_matrix, is_correspondence_file, load_correspondence
 from mimic.metric.distance import (
     REDUCTIONS,
     ROTATION_MEASURES,
@@ -39,13 +38,8 @@ from mimic.metric.hand import NO_HAND, HandWeights
 
 CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft")
 SOFT_SHARPNESS = -10.0  # xi of the correspondence "soft"
+_MAX_MATRIX = 1e6  # value of a registered matrix
 registry.reserve("correspondence", CORRESPONDENCES)
-
-
-def check_correspondence(name: str) -> None:
-    """Raises a ValueError unless a correspondence is built in, registered, or named as a file."""
-    if not is_correspondence_file(name):
-        registry.check("correspondence", name, "correspondence")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,8 +53,7 @@ class MetricConfig:
       adaptive: replace the weights of translation and rotation by the paper's distance-dependent ones.
       rotation_measure: "cosine" or "angle".
       links: "kept" (a locked joint removes no link) or "merged" (its two links become one chord; paper).
-      correspondence: "arc_length" or "overlap" (static), "hard" or "soft" (by distance), a registered name, or a
-        .csv or .npz file with a matrix, see `load_correspondence`.
+      correspondence: "arc_length" or "overlap" (static), "hard" or "soft" (by distance), or a registered name.
       link_distance: a registered function of two links, in place of the weighted parts; none where empty.
       reduction: "mean" or "frobenius".
       chains: which chains of trees correspond: "name" (left to left, thumb to thumb) or "order", see `matched_chains`.
@@ -84,7 +77,7 @@ class MetricConfig:
     def __post_init__(self) -> None:
         check_choice("links", self.links, LINKS)
         check_choice("chains", self.chains, CHAIN_MATCHES)
-        check_correspondence(self.correspondence)
+        registry.check("correspondence", self.correspondence, "correspondence")
         if self.link_distance:
             registry.check("link_distance", self.link_distance, "link_distance")
         check_choice("rotation_measure", self.rotation_measure, ROTATION_MEASURES)
@@ -104,10 +97,8 @@ class MetricConfig:
         """W, or a function of the link distances that returns it.
 
         Raises:
-          ValueError: a matrix, from a file or a registered function, that does not fit the arms.
+          ValueError: a matrix of a registered function that does not fit the arms.
         """
-        if is_correspondence_file(self.correspondence):
-            return load_correspondence(self.correspondence, expert, learner)
         chains = cast(ChainMatch, self.chains)
         constructors: dict[str, Callable[[], Correspondence]] = {
             "arc_length": lambda: arc_length_correspondence(expert, learner, chains=chains),
@@ -120,7 +111,7 @@ class MetricConfig:
         made: Any = registry.find("correspondence", self.correspondence, "metric.correspondence")(expert, learner)
         if callable(made):
             return cast(Correspondence, made)
-        return checked_matrix(made, expert, learner, repr(self.correspondence))
+        return _checked_matrix(made, expert, learner, repr(self.correspondence))
 
     def build(self, expert: Embodiment, learner: Embodiment) -> Metric:
         """The metric between two arms."""
@@ -173,6 +164,27 @@ def check_metric(config: MetricConfig) -> DistanceWeights:
             + (", ".join(different) or f"adaptive={config.adaptive}, link_distance={config.link_distance!r}")
         )
     return weights
+
+
+def _checked_matrix(
+    matrix: Any, expert: Embodiment, learner: Embodiment, label: str
+) -> Float[np.ndarray, "expert learner"]:
+    """W as an array. Raises a ValueError that starts with the label if it does not fit the arms."""
+    values, shape = np.asarray(matrix), (expert.num_links, learner.num_links)
+    if values.shape != shape:
+        raise ValueError(
+            f"correspondence: {label}: expected shape {list(shape)}, a row for each expert link "
+            f"({', '.join(expert.link_names)}) and a column for each learner link ({', '.join(learner.link_names)}), "
+            f"got {list(values.shape)}"
+        )
+    if values.dtype.kind not in "biuf" or not np.all(np.isfinite(values)):
+        raise ValueError(f"correspondence: {label}: expected finite numbers")
+    if values.min() < 0 or not 0 < values.max() <= _MAX_MATRIX:
+        raise ValueError(
+            f"correspondence: {label}: expected numbers from 0 to {_MAX_MATRIX:g}, not all of them 0, got "
+            f"{values.min():g} to {values.max():g}"
+        )
+    return values.astype(float)
 
 
 def _adaptive_weights(distances: PairDistances, **velocities: float) -> DistanceWeights:

@@ -16,7 +16,6 @@ from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, DEMONSTRATIONS
 from mimic.runs.lock import LOCK
 from mimic.trainers.config import TrainConfig, trainer_config
-from mimic.trainers.run_correspondence import COPIES, with_saved_correspondence
 from mimic.trainers.run_models import MODELS, with_original_models, with_saved_models
 from mimic.trainers.run_plugins import PLUGINS, check_plugins
 
@@ -42,7 +41,7 @@ def new_run_dir(config: TrainConfig) -> Path:
 
 def check_new_run(path: Path) -> None:
     """Raises a `ValueError` if a path exists, unless it is a folder of a run that ended before it wrote its config."""
-    inputs = DEMONSTRATIONS, MODELS, PLUGINS, *COPIES
+    inputs = DEMONSTRATIONS, MODELS, PLUGINS
     before_config = {LOCK, *inputs, *(f"{name}.partial" for name in (*inputs, CONFIG))}
     if not (os.path.isdir(path) and {file.name for file in path.iterdir()} <= before_config):
         check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
@@ -77,7 +76,6 @@ def load_config(run_dir: Path, *, saved_models: bool = True) -> TrainConfig:
         changed.
     """
     config = _read_config(run_dir)
-    config = dataclasses.replace(config, env=with_saved_correspondence(run_dir, config.env))
     return dataclasses.replace(config, env=with_saved_models(run_dir, config.env)) if saved_models else config
 
 

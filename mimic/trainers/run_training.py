@@ -38,7 +38,6 @@ from mimic.trainers.make import make_trainer
 from mimic.trainers.progress import TrainingProgress
 from mimic.trainers.report import make_report, show_report
 from mimic.trainers.run_config import check_new_run, load_config, new_run_dir, resume_command, run_schema, save_config
-from mimic.trainers.run_correspondence import save_correspondence
 from mimic.trainers.run_models import own_arms, save_models
 from mimic.trainers.run_plugins import save_plugins
 from mimic.trainers.trainer import Params, Trainer
@@ -239,7 +238,6 @@ def run_training(
     """
     with contextlib.closing(lock or _new_run(run_dir, trainer)):
         save_models(run_dir, config.env)
-        save_correspondence(run_dir, config.env)
         save_plugins(run_dir, config)
         save_config(run_dir, config)  # after the inputs: a folder without it is no run yet
         headline = f"{trainer.headline} on {hardware()['device']} (preset {trainer.settings.preset})"

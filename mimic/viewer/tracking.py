@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 from mimic.arms.arm import Arm, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints
+from mimic.base import registry
 from mimic.envs.config import EnvConfig
-from mimic.metric.config import check_correspondence
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line, similarity
@@ -45,7 +45,7 @@ class Settings:
     arm: int = 0
 
     def __post_init__(self) -> None:
-        check_correspondence(self.correspondence)
+        registry.check("correspondence", self.correspondence, "correspondence")
         for name, weight in (("translation", self.translation), ("rotation", self.rotation)):
             if not 0 <= weight < math.inf:
                 raise ValueError(f"{name}: expected a finite weight of at least 0, got {weight}")

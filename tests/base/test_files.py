@@ -12,7 +12,6 @@ from mimic.base import files
 from mimic.base.config_files import read_config
 from mimic.base.npz import read_arrays
 from mimic.deploy.policy import open_session
-from mimic.metric.correspondence_files import load_correspondence
 from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.lerobot_reading import read_lerobot
 from mimic.motions.formats.rosbag2 import read_rosbag2, write_rosbag2
@@ -88,7 +87,6 @@ FILE_READERS = {
     "config": ("a.yaml", read_config),
     "npz": ("a.npz", lambda path: read_arrays(path, ["a"])),
     "demonstrations": ("a.npz", load_demonstrations),
-    "table": ("a.csv", lambda path: load_correspondence(path, ARM, ARM)),
     "network": ("a.onnx", lambda path: open_session(path, {}, {})),
     **{
         f"motions{kind}": (f"a{kind}", lambda path: import_demonstrations(path, ARM))

@@ -18,7 +18,6 @@ PARAMS = {"layer": {"kernel": np.arange(6, dtype=np.float32).reshape(2, 3), "bia
 
 
 def write_motions(folder: Path) -> None:
-    rng = np.random.default_rng(0)
     time_, qpos = 0.1 * np.arange(60), 0.1 * np.sin(0.1 * np.arange(60)[:, None] * [1, 2, 3])
     arrays = {"qpos": qpos, "joint_names": np.array(ARM.joint_names), "frequency": np.array(10.0)}
     np.savez_compressed(folder / "imported.npz", **arrays)  # type: ignore[arg-type]
@@ -31,7 +30,6 @@ def write_motions(folder: Path) -> None:
         with h5py.File(folder / "imported.hdf5", "w") as file:
             file["demo_1/states"] = np.column_stack([time_, qpos, 0 * qpos])
             file["demo_1"].attrs["model_file"] = f"<mujoco><worldbody>{model}</worldbody></mujoco>"
-    np.savetxt(folder / "correspondence.csv", rng.random((3, 3)), "%.3f", delimiter=",")
     several = np.stack([qpos, -qpos])
     Demonstrations(several, 0 * several, several[:, -1], 0.1, ARM.name, ARM.joint_names).save(folder / "recorded.npz")
     for name, write in {"lerobot": write_lerobot, "bags": write_rosbag2}.items():

@@ -1,18 +1,15 @@
-"""What runs record of plugins and correspondence files, and what is said where these are missing."""
+"""What runs record of plugins, and what is said where these are missing."""
 
 import dataclasses
 import json
-import shutil
 
-import numpy as np
 import pytest
 
 import mimic
 from mimic.envs.config import EnvConfig
 from mimic.trainers.config import PPOConfig, TrainConfig, TrainerConfig, trainer_config
 from mimic.trainers.make import make_trainer
-from mimic.trainers.run_config import check_new_run, load_config, save_config
-from mimic.trainers.run_correspondence import save_correspondence
+from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.run_plugins import PLUGINS, save_plugins, used_plugins
 
 
@@ -20,7 +17,6 @@ def write(run_dir, **env):
     config = TrainConfig(mimic.env_config("planar4dof", **env), PPOConfig().resolve("cpu"))
     run_dir.mkdir()
     save_config(run_dir, config)
-    save_correspondence(run_dir, config.env)
     save_plugins(run_dir, config)
     return run_dir
 
@@ -79,21 +75,6 @@ def test_a_run_directory_imports_no_code(tmp_path, own_registry, monkeypatch):
     (run_dir / PLUGINS).write_text('{"correspondence:attack": "hostile"}')
     with pytest.raises(ValueError, match="which is not loaded: install its package, or add --plugin hostile"):
         load_config(run_dir)
-
-
-def test_a_run_keeps_its_correspondence_file(tmp_path, own_registry):
-    path = tmp_path / "matrix.csv"
-    np.savetxt(path, np.ones((7, 4)), delimiter=",")
-    run_dir = write(tmp_path / "run", metric={"correspondence": str(path)})
-    check_new = tmp_path / "new"
-    check_new.mkdir()
-    shutil.copy(run_dir / "correspondence.csv", check_new)
-    check_new_run(check_new)  # of a run that ended before it had a config
-    path.unlink()
-    shutil.move(run_dir, tmp_path / "moved")
-    metric = load_config(tmp_path / "moved").env.metric
-    arms = mimic.env_config("planar4dof").build_arms().embodiments
-    np.testing.assert_array_equal(metric.build(*arms).correspondence, np.ones((7, 4)))
 
 
 @dataclasses.dataclass(frozen=True)
