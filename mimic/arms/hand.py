@@ -137,24 +137,26 @@ def _named_or_between_fingers(
     """The origin by the names of frames and by the fingers; None where there are neither."""
     fingers, hand = gripper.fingers, best_frame(frames, hand_rank, anchor)
     tools = [frame for frame in frames if tool_rank(frame.name) is not None]
-    distal = [frame for frame in tools if not _is_mount(frame, gripper, wrist)]
+    distal = [frame for frame in tools if len(fingers) < 2 or not _is_mount(frame, gripper, wrist)]
+    is_marked = all(finger.has_tip for finger in fingers)
+    beyond = f"{fingers[0].frame} is distal of it" if fingers else ""
     if tool := best_frame(distal, tool_rank, anchor):
         at_tool = [tool, *(frame for frame in distal if frame is not tool and _are_at_one_point(frame, tool))]
-        return _Origin(tool.point, at_tool, f"{tool}, named as tools are", _rivals(distal, tool))
+        doubt = _rivals(distal, tool) or (beyond if _is_mount(tool, gripper, wrist) else "")
+        return _Origin(tool.point, at_tool, f"{tool}, named as tools are", doubt)
     if len(fingers) > 1:
-        is_marked = all(finger.has_tip for finger in fingers)
         doubt = "" if is_marked else "no frame marks the tips of the fingers, so that it is between their joints"
         told = list(filter(None, (best_frame(tools, tool_rank, anchor) or hand,)))
         return _Origin(gripper.middle, told, f"between {', '.join(str(x.frame) for x in fingers)}", doubt)
     if hand:
-        doubt = f"{fingers[0].frame} is distal of it" if fingers else ""
-        return _Origin(hand.point, [hand], f"{hand}, named as hands are", doubt)
-    return _Origin(fingers[0].frame.point, [], f"{fingers[0].frame}, a finger") if fingers else None
+        return _Origin(hand.point, [hand], f"{hand}, named as hands are", beyond)
+    doubt = "" if is_marked else "no frame marks the tip of the finger, so that it is at its joint"
+    return _Origin(fingers[0].frame.point, [], f"{fingers[0].frame}, a finger", doubt) if fingers else None
 
 
 def _is_mount(frame: Frame, gripper: Gripper, wrist: Wrist) -> bool:
-    """Whether a gripper is mounted at a frame: its fingers, two or more, all begin farther along the approach."""
-    directions = approach(gripper.middle, wrist) if len(gripper.fingers) > 1 else []
+    """Whether a gripper is mounted at a frame: all its fingers begin farther along the approach."""
+    directions = approach(gripper.middle, wrist) if gripper.fingers else []
     return bool(directions) and all((finger.base - frame.point) @ directions[0] > _APART for finger in gripper.fingers)
 
 

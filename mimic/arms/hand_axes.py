@@ -19,6 +19,7 @@ _ONE_WAY = 0.6  # ratio of two principal values above which fingers open in seve
 _ACROSS = 0.5  # mean motion of the gripper's joints across the approach, below which the approach is another
 _BESIDE = 1e-3  # m; a finger so far from the middle tells its side
 _NAMES = "x", "y", "z"
+_UNKNOWN_OPENING = "nothing tells how a gripper would open"  # also with a frame that does not point forward with z
 
 
 class Axes(NamedTuple):
@@ -76,10 +77,10 @@ def find_axes(point: np.ndarray, wrist: Wrist, frames: Sequence[Frame] = (), gri
     x, x_reason = _opening_axis(z, gripper)
     if x is None and frame is not None:
         x, x_reason = _opening_of_frame(z, frame)
-        doubt = doubt or _other_opening(x, z, frames)
+        doubt = doubt or _other_opening(x, z, frames) or ("" if _agreeing(frame, z).endswith("z") else _UNKNOWN_OPENING)
     if x is None:
         x, x_reason = _opening_by_joints(z, wrist)
-        unknown = "nothing tells how a gripper would open" if wrist.previous is not None else ""  # an arm in a plane
+        unknown = _UNKNOWN_OPENING if wrist.previous is not None else ""  # an arm in a plane
         doubt = "; ".join(filter(None, (doubt, unknown)))
     x = x - (x @ z) * z
     x = x / np.linalg.norm(x)

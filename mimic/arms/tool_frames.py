@@ -10,12 +10,13 @@ from jaxtyping import Float
 from mimic.arms.model_tree import ancestors, body_id, joint_ids
 from mimic.arms.names import finger_side, is_sensor, tool_rank
 
-_SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)  # as int: a MuJoCo enum equals a NumPy integer in one order of operands only
+# As ints: a MuJoCo enum equals a NumPy integer in one order of the operands and not in the other.
+_SLIDE, _SPHERE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtGeom.mjGEOM_SPHERE)
 _AT_JOINT = 1e-6  # m
 
 
 class Frame(NamedTuple):
-    """A body or site that is fixed to a link, in the world; the columns of `rotation` are its axes."""
+    """A body, site or sphere that is fixed to a link, in the world; the columns of `rotation` are its axes."""
 
     kind: str
     name: str
@@ -70,13 +71,17 @@ NO_GRIPPER = Gripper([], [])
 
 
 def fixed_frames(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Iterator[Frame]:
-    """The sites and bodies that are fixed to a body, itself left out, in the order of the model."""
+    """The sites and bodies that are fixed to a body, itself left out, and spheres that mark a tool by their name."""
     for site in range(model.nsite):
         if model.body_weldid[model.site_bodyid[site]] == body:
             yield _site_frame(model, data, site)
     for other in range(body + 1, model.nbody):
         if model.body_weldid[other] == body:
             yield body_frame(model, data, other)
+    for geom in np.flatnonzero(model.geom_type == _SPHERE):
+        name = model.geom(geom).name
+        if model.body_weldid[model.geom_bodyid[geom]] == body and tool_rank(name) is not None:
+            yield Frame("sphere", name, data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3))
 
 
 def find_frame(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Frame:

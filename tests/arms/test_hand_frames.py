@@ -63,6 +63,7 @@ CASES = {  # what is on the last link, the joints' axes, and the approach and th
     "open hinges": (HINGES, X, Z),
     "jaw": (JAW + frame("gripper_frame", "0.1 0 -0.01", TO_X), X, Z),
     "no frame": ("", X, -Z),
+    "a sphere that marks the tool": ('<geom name="end_effector" size="0.001" pos="0.1 0 0"/>', X, Y),
     "a frame that no name tells": (frame("plate", "0.1 0.02 0", 'euler="0.4 0.5 0.6"'), X, -Z),
 }
 
@@ -102,6 +103,9 @@ def test_a_wrist_that_pitches_approaches_along_its_link(content, opening):
             "the opening by site 'ee' is",
         ),
         (JAW + frame("gripper_stator", "0.01 0 0"), "body 'moving_jaw' is distal of it"),
+        (JAW + frame("tool0", "0.01 0 0", TO_X), "body 'moving_jaw' is distal of it"),
+        (JAW, "no frame marks the tip of the finger"),
+        (frame("ee_link", "0.1 0 0"), "nothing tells how a gripper would open"),
         (SLIDES, "no frame marks the tips of the fingers"),
         ("", "no name tells where the tool is; nothing tells how a gripper would open"),
     ],

@@ -3,10 +3,12 @@
 import jax
 import numpy as np
 import pytest
+from mujoco import MjModel
 
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import arm_arrays
+from mimic.arms.embodiment import load_mjcf, panda_path
 from mimic.metric.config import MetricConfig
 from mimic.metric.correspondence import arc_length_correspondence
 from mimic.metric.distance import DistanceWeights, Metric
@@ -15,6 +17,7 @@ from mimic.metric.kinematics import hand_frames, link_state_table, link_states
 from mimic.metric.motion_distance import motion_distance
 from mimic.retargeting.pose import imitate_pose
 from mimic.retargeting.pose_objective import automatic_derivatives, pose_objective
+from tests.helpers.original_model import package_file, ur_like, urdf
 
 # Few joints and links, which compile quickly; the last joint is the one about the hand's axis.
 EXPERT = mimic.panda(locked=[1, 3, 5], links="merged")
@@ -78,15 +81,37 @@ def test_the_derivatives_of_the_pose_search_equal_automatic_differentiation(x64,
         np.testing.assert_allclose(np.ravel(columns), np.ravel(expected.hessian[row][: row + 1]), atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["panda", "planar"])
-def test_each_joint_that_moves_the_hand_changes_the_distance(x64, name):
-    arm = EXPERT if name == "panda" else mimic.planar_arm([0.3, 0.2, 0.1])
-    metric = MetricConfig(hand_rotation=0.1).build(arm, arm)
+ROBOTS = "robosuite/models/assets/robots"
+ARMS = {
+    "panda": lambda _: mimic.panda(),
+    "pair": lambda _: load_mjcf(panda_path("panda_pair"), tip=["left_tcp", "right_tcp"]),
+    "planar": lambda _: mimic.planar_arm([0.3, 0.2, 0.1]),
+    "MJCF": lambda _: load_mjcf(MjModel.from_xml_string(ur_like())),
+    "URDF": lambda folder: _read_urdf(folder / "four.urdf"),
+} | {
+    f"robosuite {name}": lambda _, name=name: load_mjcf(package_file(f"{ROBOTS}/{name}/robot.xml"), tip="right_hand")
+    for name in ("panda", "ur5e", "iiwa", "kinova3", "jaco", "sawyer", "xarm7", "baxter")
+}  # fmt: skip
+
+
+def _read_urdf(file):
+    file.write_text(urdf())
+    return load_mjcf(file)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_each_joint_that_moves_the_hand_changes_the_distance(tmp_path, name):
+    """A joint rotates the hand by its own angle, whatever the other angles are."""
+    arm = ARMS[name](tmp_path)
+    metric, angle = MetricConfig().build(arm, arm), 0.5
     qpos = np.random.default_rng(1).uniform(-1, 1, arm.num_joints)
-    shifted = qpos + 0.5 * np.eye(arm.num_joints)
-    distance = metric(link_states(arm, qpos), link_states(arm, shifted))
-    assert np.all(np.asarray(distance) > 1e-3)
-    assert float(metric(link_states(arm, qpos), link_states(arm, qpos))) == 0
+    shifted = np.concatenate([[qpos], qpos + angle * np.eye(arm.num_joints)])
+    states = [
+        link_state_table(arm, q, np.zeros_like(q), float) for q in (np.broadcast_to(qpos, shifted.shape), shifted)
+    ]
+    same, *moved = np.asarray(jax.jit(metric)(*states))
+    assert same == 0
+    assert np.all(np.array(moved) >= 0.02 * np.pi / 2 * (1 - np.cos(angle)) / len(arm.hand_joint) - 1e-6)
 
 
 def test_a_hand_is_found_with_its_roll_by_its_weight_alone():
