@@ -6,8 +6,11 @@ minimises the sum of the pulls within a box of joint angles: Gauss-Newton's meth
 then its rotation, then the links, so that a hand out of reach gives up its rotation before its position.
 """
 
-from typing import NamedTuple
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 from jaxtyping import Float
 
@@ -28,85 +31,104 @@ class Goal(NamedTuple):
 
     Attributes:
       points: [leader_links, 3] positions of the leader's links, in its own chain lengths.
-      rows: [rows, 3] of the follower's hand positions, link directions and hand axes.
+      pulls: [rows, 3] targets of the follower's link directions, hand positions and hand axes, times the stiffness.
       stiffness: [rows] of these pulls.
-      position, axes: [pairs, 3] and [pairs, 3, 3] of the matched hands; their axes are rows.
+      hands: [4 pairs, 3] positions of the matched hands, then their axes.
     """
 
     points: Float[np.ndarray, "leader_links 3"]
-    rows: Float[np.ndarray, "rows 3"]
+    pulls: Float[np.ndarray, "rows 3"]
     stiffness: Float[np.ndarray, " rows"]
-    position: Float[np.ndarray, "pairs 3"]
-    axes: Float[np.ndarray, "pairs 3 3"]
+    hands: Float[np.ndarray, "hand_rows 3"]
 
 
-class Rows(NamedTuple):
-    """Points and unit vectors of an arm, [lanes, number, 3] each, in its base frame and in chain lengths.
-
-    Attributes:
-      anchors, axes: of the joints.
-      moving: link positions, hand positions, link directions, and hand axes.
-    """
-
-    anchors: np.ndarray
-    axes: np.ndarray
-    moving: np.ndarray
+Rows = Float[np.ndarray, "lanes rows 3"]  # points and unit vectors of an arm in its base frame, in chain lengths
 
 
 class ArmRows:
     """Kinematics of an arm as a table of rows; hands that the model does not know are the ends of its chains.
 
+    MuJoCo's kinematics of a model of joints and sites: one call in C for what takes NumPy twenty.
+
     Attributes:
       links, hands: their numbers.
       unit: chain length [m].
       knows_roll: whether the rotation of the hands about their z-axes is known.
+      anchors, axes: rows of the joints, as slices.
+      points, directions, positions: rows of the links and of the hands' positions; the hands' axes are last.
+      moving: rows from the links on.
     """
 
     def __init__(self, arm: Embodiment):
-        self.unit, joints, self.links = float(arm.chain_length), arm.num_joints, arm.num_links
-        axis, anchor = np.asarray(arm.joint_axis, float), np.asarray(arm.joint_anchor, float) / self.unit
-        skew = np.cross(np.eye(3), axis[:, None])
-        self._sine, self._versine = np.zeros((2, joints, 1, 4, 4))
-        for matrix, part in ((self._sine, skew), (self._versine, skew @ skew)):
-            matrix[:, 0, :3, :3], matrix[:, 0, :3, 3] = part, -(part @ anchor[..., None])[..., 0]
-        self._parents, self.knows_roll = arm.joint_parent, bool(arm.hand_joint)
-        positions, rotations, hand_joint = _hands(arm)
+        self.unit, self._joints, self.links = float(arm.chain_length), arm.num_joints, arm.num_links
+        self.knows_roll, (positions, rotations, hand_joint) = bool(arm.hand_joint), _hands(arm)
         self.hands = len(hand_joint)
-        points = [anchor, arm.link_position / self.unit, positions / self.unit]
-        directions = [axis, arm.link_rotation[:, :, 0], np.swapaxes(rotations, 1, 2).reshape(-1, 3)]
-        order = points[0], directions[0], points[1], points[2], directions[1], directions[2]
-        is_point = np.repeat([1.0, 0.0, 1.0, 1.0, 0.0, 0.0], [len(rows) for rows in order])
-        self._zero = np.concatenate([np.concatenate(order), is_point[:, None]], axis=1)[:, None, :, None]
-        of_rows = [*arm.link_joint, *hand_joint, *arm.link_joint, *np.repeat(hand_joint, 3)]
-        self._frame = np.array([*range(joints), *range(joints), *of_rows]) + 1
-        self._joints, self._is_point = joints, is_point[2 * joints :]
-        self._moves = np.array([[_is_ancestor(arm, joint, row) for row in of_rows] for joint in range(joints)])[:, None]
+        site_joint = [*arm.link_joint, *hand_joint]
+        poses = np.concatenate([arm.link_position, positions]), np.concatenate([arm.link_rotation, rotations])
+        self._model = _model(arm, site_joint, poses[0], poses[1], self.unit)
+        self._data = data = mujoco.MjData(self._model)
+        joints = np.array([self._model.joint(str(joint)).id for joint in range(self._joints)])
+        sites = np.array([self._model.site(str(site)).id for site in range(len(site_joint))])
+        self._qpos, self._address = data.qpos, self._model.jnt_qposadr[joints]
+        self._parts = [x.ravel() for x in (data.xanchor, data.xaxis, data.site_xpos, data.site_xmat)]
+        anchors, axes, points, matrices = np.split(
+            np.arange(sum(map(len, self._parts))), np.cumsum([len(x) for x in self._parts])[:-1]
+        )
+        anchors, axes, points = (x.reshape(-1, 3) for x in (anchors, axes, points))
+        columns = matrices.reshape(-1, 3, 3).swapaxes(1, 2)[sites]
+        links, hands = self.links, self.hands
+        rows = anchors[joints], axes[joints], points[sites[:links]], columns[:links, 0], points[sites[links:]]
+        self._index = np.concatenate([*rows, columns[links:].reshape(-1, 3)])
+        edges = np.cumsum([0, *map(len, rows)]).tolist()
+        self.anchors, self.axes, self.points, self.directions, self.positions = map(slice, edges, edges[1:])
+        self.moving, self._hand_axes = slice(edges[2], None), edges[-1]
+        of_rows = [*arm.link_joint, *arm.link_joint, *hand_joint, *np.repeat(hand_joint, 3)]
+        is_point = np.repeat([1.0, 0.0, 1.0, 0.0], [links, links, hands, 3 * hands])
+        moves = [[_is_ancestor(arm, joint, row) for row in of_rows] for joint in range(self._joints)]
+        self._moves, self._is_point = np.array(moves, float)[:, :, None], is_point[:, None]
 
     def __call__(self, qpos: Float[np.ndarray, "lanes joints"]) -> Rows:
         """The rows at joint angles [rad]."""
-        angle = qpos.T[..., None, None]
-        steps = _IDENTITY + np.sin(angle) * self._sine + (1 - np.cos(angle)) * self._versine
-        frames = np.empty((self._joints + 1, len(qpos), 4, 4))
-        frames[0] = _IDENTITY
-        for joint, parent in enumerate(self._parents):
-            np.matmul(frames[parent + 1], steps[joint], out=frames[joint + 1])
-        rows = (frames[self._frame] @ self._zero)[..., :3, 0].swapaxes(0, 1)
-        return Rows(rows[:, : self._joints], rows[:, self._joints : 2 * self._joints], rows[:, 2 * self._joints :])
+        rows = np.empty((len(qpos), *self._index.shape))
+        for lane, angles in enumerate(qpos):
+            self._qpos[self._address] = angles
+            mujoco.mj_kinematics(self._model, self._data)
+            np.concatenate(self._parts).take(self._index, out=rows[lane], mode="clip")
+        return rows
 
-    def hand(self, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [lanes, hands, 3] and axes [lanes, hands, 3, 3], one a row."""
-        position = rows.moving[:, self.links : self.links + self.hands]
-        return position, rows.moving[:, 2 * self.links + self.hands :].reshape(len(position), self.hands, 3, 3)
+    def hand_rows(self, hands: np.ndarray) -> np.ndarray:
+        """Numbers [4 hands] of the rows of some hands: positions, then three axes of each."""
+        axes = self._hand_axes + 3 * hands[:, None] + np.arange(3)
+        return np.concatenate([self.positions.start + hands, axes.ravel()])
 
-    def jacobian(self, rows: Rows) -> Float[np.ndarray, "lanes joints 3 rows"]:
+    def jacobian(self, rows: Rows) -> Float[np.ndarray, "lanes joints moving 3"]:
         """Derivatives of the moving rows with respect to the joint angles."""
-        cross = (rows.axes @ _LEVI_CIVITA).reshape(*rows.axes.shape[:2], 3, 3)
-        moments = cross @ rows.anchors[..., None]
-        return (cross @ np.swapaxes(rows.moving, 1, 2)[:, None] - moments * self._is_point) * self._moves
+        cross = (rows[:, self.axes] @ _LEVI_CIVITA).reshape(-1, self._joints, 3, 3)
+        return ((rows[:, None, self.moving] - self._is_point * rows[:, self.anchors, None]) @ cross) * self._moves
 
 
-_IDENTITY = np.eye(4)
-_LEVI_CIVITA = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1).reshape(3, 9)
+_LEVI_CIVITA = np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)  # v @ (a @ this) is a x v
+
+
+def _model(
+    arm: Embodiment, site_joint: Sequence[int], positions: np.ndarray, rotations: np.ndarray, unit: float
+) -> mujoco.MjModel:
+    """Joints of an arm and sites that move with them, named by their numbers, in units of a length."""
+    spec = mujoco.MjSpec()
+    spec.compiler.autolimits, spec.compiler.degree = False, False
+    bodies, origins = [spec.worldbody], [np.zeros(3)]
+    for joint, parent in enumerate(arm.joint_parent):
+        anchor = np.asarray(arm.joint_anchor[joint], float) / unit
+        body = bodies[parent + 1].add_body(
+            pos=anchor - origins[parent + 1], mass=1.0, inertia=np.ones(3), explicitinertial=True
+        )
+        body.add_joint(name=str(joint), axis=np.asarray(arm.joint_axis[joint], float))
+        bodies, origins = [*bodies, body], [*origins, anchor]
+    for site, (joint, position, rotation) in enumerate(zip(site_joint, positions, rotations, strict=True)):
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, np.asarray(rotation, float).ravel())
+        bodies[joint + 1].add_site(name=str(site), pos=position / unit - origins[joint + 1], quat=quaternion)
+    return spec.compile()
 
 
 def _hands(arm: Embodiment) -> tuple[np.ndarray, np.ndarray, list[int]]:
@@ -147,42 +169,37 @@ class LivePose:
         factors = np.asarray(metric.factors(leader.hands, follower.hands))[:, : leader.links, : follower.links]
         translation, rotation = (factors[PARTS.index(part)] for part in ("translation", "rotation"))
         self._translation, self._rotation = _POSTURE * translation, _POSTURE * np.pi / 2 * rotation.T
-        self._leader, self._follower, links, hands = leader, follower, follower.links, follower.hands
-        self.knows_roll, self._matched = leader.knows_roll and follower.knows_roll, pairs[:, 1]
-        # Of the cosine of the rotation, r (1 - cos theta) = r/4 sum |e_k - t_k|^2 over the axes.
-        of_axes = _ROTATION * (np.full(3, 0.5) if self.knows_roll else np.eye(3)[2])
-        self._directed, self._axes = (
-            slice(hands, hands + links),
-            hands + links + 3 * self._matched[:, None] + np.arange(3),
-        )
-        self._stiffness, self._rows = np.zeros(4 * hands + links), np.zeros((4 * hands + links, 3))
-        self._stiffness[self._matched], self._stiffness[self._axes] = 1, of_axes
+        from scipy.linalg.lapack import dposv  # half a second to import; np.linalg.solve takes eight times as long
 
-    def goal(
-        self,
-        rows: Rows,
-        position: Float[np.ndarray, "pairs 3"],
-        axes: Float[np.ndarray, "pairs 3 3"],
-        to_base: Float[np.ndarray, "3 3"],
-    ) -> Goal:
-        """The goal of the leader's rows of one posture, with hands that are given in the follower's base frame.
+        self._posv: Any = dposv  # of symmetric matrices, which the damping makes positive definite
+        self._leader, self._follower, self._pairs, matched = leader, follower, len(pairs), pairs[:, 1]
+        self.knows_roll = leader.knows_roll and follower.knows_roll
+        # Of the cosine of the rotation, r (1 - cos theta) = r/4 sum |e_k - t_k|^2 over the axes.
+        of_axes = np.full(3, 0.5) if self.knows_roll else np.eye(3)[2]
+        self._chord = of_axes / 4  # sin^2 of half the angle
+        self._hands = follower.hand_rows(matched)
+        self._of_hands = self._hands - follower.directions.start  # among the rows of a goal
+        self._stiffness = np.zeros(follower.links + 4 * follower.hands)
+        self._pulls = np.zeros((len(self._stiffness), 3))
+        self._hand_stiffness = np.concatenate([np.ones(len(pairs)), np.tile(_ROTATION * of_axes, len(pairs))])[:, None]
+        self._stiffness[self._of_hands] = self._hand_stiffness[:, 0]
+
+    def goal(self, leader: Float[np.ndarray, "rows 3"], hands: Float[np.ndarray, "hand_rows 3"]) -> Goal:
+        """The goal of one posture of the leader.
 
         Args:
-          rows: of the leader.
-          position: of the matched hands [follower's chain lengths].
-          axes: of the hands, one a row.
-          to_base: rotation or reflection from the leader's base frame to the follower's.
+          leader: its rows, with the axes of the follower's base frame.
+          hands: [4 pairs, 3] positions of the matched hands in the follower's base frame [follower's chain lengths],
+            then their axes.
         """
-        links, hands = self._leader.links, self._leader.hands
-        moving, targets, stiffness = rows.moving[0] @ to_base.T, self._rows.copy(), self._stiffness.copy()
-        pulls = self._rotation @ moving[links + hands : 2 * links + hands]
-        strengths = np.sqrt(np.einsum("ij,ij->i", pulls, pulls))
-        targets[self._directed], stiffness[self._directed] = pulls / (strengths[:, None] + 1e-30), strengths
-        targets[self._matched], targets[self._axes] = position, axes
-        return Goal(moving[:links], targets, stiffness, position, axes)
+        links, pulls, stiffness = self._follower.links, self._pulls.copy(), self._stiffness.copy()
+        pulls[:links] = directed = self._rotation.dot(leader[self._leader.directions])
+        np.sqrt(np.vecdot(directed, directed), out=stiffness[:links])
+        pulls[self._of_hands] = self._hand_stiffness * hands
+        return Goal(leader[self._leader.points], pulls, stiffness, hands)
 
     def pulls(self, goal: Goal, rows: Rows, longest: float = FAR, left: float = FAR) -> tuple[np.ndarray, ...]:
-        """Forces [lanes, rows, 3], stiffnesses [lanes, rows], damping [lanes] and cost [lanes] of the pulls.
+        """Forces [lanes, moving, 3], stiffnesses [lanes, moving] and damping [lanes] of the pulls.
 
         Args:
           goal: of the pulls.
@@ -190,30 +207,45 @@ class LivePose:
           longest: pull on a hand [chain lengths].
           left: pull that the last goal left, which damps this step [chain lengths].
         """
-        links, moving, hands = self._follower.links, rows.moving, self._follower.hands
-        force, stiffness = np.empty(moving.shape), np.empty(moving.shape[:2])
+        links, moving = self._follower.links, rows[:, self._follower.moving]
+        stiffness = np.empty(moving.shape[:2])
         # Weights w of the distances of links, as w / |d| |d|^2.
-        apart = moving[:, None, :links] - goal.points[:, None]
-        distance = np.sqrt(np.einsum("lijk,lijk->lij", apart, apart) + _SMOOTHING**2)
-        tension = self._translation / distance
-        force[:, :links], stiffness[:, :links] = np.einsum("lij,lijk->ljk", tension, apart), tension.sum(axis=1)
-        difference = moving[:, links:] - goal.rows
-        force[:, links:], stiffness[:, links:] = goal.stiffness[:, None] * difference, goal.stiffness
-        squares = np.einsum("lik,lik->li", difference, difference)
-        cost = np.einsum("ij,lij->l", self._translation, distance) + squares @ goal.stiffness / 2
-        length = np.sqrt(squares[:, :hands]) + 1e-30
-        pull = np.minimum(length, longest)
-        force[:, links : links + hands] *= (pull / length)[..., None]
-        return force, stiffness, _DAMPING + _LEVER * np.minimum(pull @ goal.stiffness[:hands], left), cost
+        tension = self._translation / self._link_distances(goal, rows)
+        tension.sum(axis=1, out=stiffness[:, :links])
+        stiffness[:, links:] = goal.stiffness
+        force = moving * stiffness[..., None]
+        force[:, :links] -= tension.swapaxes(1, 2) @ goal.points
+        force[:, links:] -= goal.pulls
+        of_hands = force[:, 2 * links : 2 * links + self._follower.hands]  # stiffness 1, or 0 without a match
+        length = np.sqrt(np.vecdot(of_hands, of_hands))
+        fraction = longest / np.maximum(length, longest)
+        of_hands *= fraction[..., None]
+        return force, stiffness, _DAMPING + _LEVER * np.minimum(np.vecdot(length, fraction), left)
 
-    def errors(self, goal: Goal, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-        """Maximum distance [m] and angle [rad] of the hands, [lanes] each."""
-        difference = rows.moving[:, self._follower.links :] - goal.rows
-        squares = np.einsum("lik,lik->li", difference, difference)
-        apart = self._follower.unit * np.sqrt(squares[:, self._matched].max(axis=1))
-        chord = squares[:, self._axes]  # of one axis 4 sin^2 of half the angle, of all three twice as much
-        chord = chord.sum(axis=-1) / 8 if self.knows_roll else chord[..., 2] / 4
-        return apart, 2 * np.arcsin(np.sqrt(np.minimum(chord.max(axis=1), 1)))
+    def cost(self, goal: Goal, rows: Rows) -> Float[np.ndarray, " lanes"]:
+        """Sum of the pulls' costs, k |x - t|^2 / 2, where all rows but the hands' positions are unit vectors."""
+        of_links = (self._translation * self._link_distances(goal, rows)).sum(axis=(1, 2))
+        apart, pairs = rows[:, self._hands[: self._pairs]] - goal.hands[: self._pairs], self._pairs
+        directions = rows[:, self._follower.directions.start :].copy()
+        directions[:, self._of_hands[:pairs]] = 0
+        stiffness = goal.stiffness.sum() - pairs
+        turned = stiffness - (directions * goal.pulls).sum(axis=(1, 2))
+        return of_links + turned + np.vecdot(apart, apart).sum(axis=1) / 2
+
+    def _link_distances(self, goal: Goal, rows: Rows) -> Float[np.ndarray, "lanes leader_links links"]:
+        apart = rows[:, None, self._follower.points] - goal.points[:, None]
+        return np.sqrt(np.vecdot(apart, apart) + _SMOOTHING**2)
+
+    def errors(self, goal: Goal, rows: Rows) -> tuple[list[float], list[float]]:
+        """Maximum distance [m] and angle [rad] of the hands, of each lane."""
+        apart, pairs = rows.take(self._hands, axis=1) - goal.hands, self._pairs
+        squares = np.vecdot(apart, apart)
+        chords = squares[:, pairs:].reshape(-1, pairs, 3) @ self._chord
+        positions, chords = squares[:, :pairs].max(axis=1).tolist(), chords.max(axis=1).tolist()
+        return (
+            [self._follower.unit * math.sqrt(x) for x in positions],
+            [2 * math.asin(min(math.sqrt(x), 1.0)) for x in chords],
+        )
 
     def step(
         self,
@@ -224,8 +256,8 @@ class LivePose:
         longest: float = NEAR,
         left: float = FAR,
         rows: Rows | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Joint angles within the box [lower, upper] after a step, and the cost [lanes] before it.
+    ) -> Float[np.ndarray, "lanes joints"]:
+        """Joint angles within the box [lower, upper] after a step.
 
         Args:
           goal: of the step.
@@ -235,31 +267,36 @@ class LivePose:
           rows: at these angles, where they are known.
         """
         rows = self._follower(qpos) if rows is None else rows
-        force, stiffness, damping, cost = self.pulls(goal, rows, longest, left)
+        force, stiffness, damping = self.pulls(goal, rows, longest, left)
         columns = self._follower.jacobian(rows)
         flat = columns.reshape(*columns.shape[:2], -1)
-        gradient = (flat @ np.swapaxes(force, 1, 2).reshape(len(qpos), -1, 1))[..., 0]
-        hessian = (columns * stiffness[:, None, None]).reshape(flat.shape) @ np.swapaxes(flat, 1, 2)
-        return qpos + _step_in_box(hessian, damping, gradient, lower - qpos, upper - qpos), cost
+        gradient = (flat @ force.reshape(len(qpos), -1, 1))[..., 0]
+        hessian = (columns * stiffness[:, None, :, None]).reshape(flat.shape) @ flat.swapaxes(1, 2)
+        return qpos + self._step_in_box(hessian, damping, gradient, lower - qpos, upper - qpos)
 
+    def _step_in_box(
+        self, hessian: np.ndarray, damping: np.ndarray, gradient: np.ndarray, lower: np.ndarray, upper: np.ndarray
+    ) -> np.ndarray:
+        """The minimum of a damped quadratic function in a box, where joints that reach an edge stay there."""
+        joints = hessian.shape[-1]
+        hessian.reshape(-1, joints * joints)[:, :: joints + 1] += damping[:, None]
+        right = -gradient
+        step, free = self._solve(hessian, right), 1.0
+        for _ in range(_PASSES):
+            inside = np.minimum(np.maximum(step, lower), upper)
+            is_inside = inside == step
+            if is_inside.all():
+                break
+            free = free * is_inside  # what is held is at the edge, and stays
+            held = 1.0 - free
+            fixed = held * inside
+            matrix = hessian * (free[:, :, None] * free[:, None])
+            matrix.reshape(-1, joints * joints)[:, :: joints + 1] += held
+            step = self._solve(matrix, free * (right - (hessian @ fixed[..., None])[..., 0]) + fixed)
+        return np.minimum(np.maximum(step, lower), upper)
 
-def _step_in_box(
-    hessian: np.ndarray, damping: np.ndarray, gradient: np.ndarray, lower: np.ndarray, upper: np.ndarray
-) -> np.ndarray:
-    """The minimum of a damped quadratic function in a box, where joints that reach an edge stay there."""
-    joints = np.arange(hessian.shape[-1])
-    hessian[:, joints, joints] += damping[:, None]
-    step = np.linalg.solve(hessian, -gradient[..., None])[..., 0]
-    free = np.ones(gradient.shape, bool)
-    for _ in range(_PASSES):
-        inside = np.minimum(np.maximum(step, lower), upper)
-        held = (inside != step) & free
-        if not held.any():
-            break
-        free &= ~held
-        fixed = np.where(free, 0, inside)
-        matrix = np.where(free[:, :, None] & free[:, None], hessian, 0)
-        matrix[:, joints, joints] += ~free
-        right = np.where(free, -gradient - (hessian @ fixed[..., None])[..., 0], fixed)
-        step = np.linalg.solve(matrix, right[..., None])[..., 0]
-    return np.minimum(np.maximum(step, lower), upper)
+    def _solve(self, matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
+        solution = np.empty(right.shape)
+        for lane in range(len(right)):
+            solution[lane] = self._posv(matrices[lane], right[lane])[1]
+        return solution

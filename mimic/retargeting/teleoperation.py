@@ -5,6 +5,7 @@ takes steps to this goal within the velocity limits, see `mimic.retargeting.live
 branch. The command follows the posture by Ruckig's online trajectories, within all limits and always able to stop.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -18,7 +19,7 @@ from mimic.base.distribution import install_command
 from mimic.control.limits import JointLimits, joint_limits
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.hand_target import matched_hands, placement
-from mimic.retargeting.live_pose import FAR, NEAR, ArmRows, Goal, LivePose, Rows
+from mimic.retargeting.live_pose import FAR, NEAR, ArmRows, Goal, LivePose
 from mimic.retargeting.pose import wrap_angles
 
 HANDS = ("exact", "relative")
@@ -112,20 +113,26 @@ class Teleoperator:
         for name, number in (("scale", scale), ("rate", rate)):
             if not (np.isfinite(number) and number > 0):
                 raise ValueError(f"{name}: expected a finite number above 0, got {number}")
-        self._period, self._scale, self._is_relative = 1.0 / rate, scale, hand == "relative"
+        self._period, self._is_relative = 1.0 / rate, hand == "relative"
         self.limits = limits or follower_limits(follower, velocity)
         self.leader, self.follower = leader, follower
         self._rows = ArmRows(leader), ArmRows(follower)
         self._pairs = matched_hands(leader, follower)
         self._pose = LivePose(*self._rows, self._pairs, (metric or MetricConfig()).build(leader, follower))
         where, mirrored = placement(base), np.array([1.0, -1.0 if mirror else 1.0, 1.0])
-        self._to_base, self._origin = where.rotation.T * mirrored, where.rotation.T @ where.position
-        self._mirrored = mirrored[:, None]
+        self._to_base, of_leader, of_follower = mirrored[:, None] * where.rotation, *(rows.unit for rows in self._rows)
+        self._factor = scale * of_leader / of_follower
+        self._origin = where.rotation.T @ where.position / of_follower
+        self._mirrored = np.tile(mirrored, len(self._pairs))[:, None] if mirror else None
+        self._leader_hands, self._follower_hands = (
+            rows.hand_rows(hands) for rows, hands in zip(self._rows, self._pairs.T, strict=True)
+        )
         self._samples = _Samples(leader, self._period)
         self._gripper = _Gripper(*grippers, self._period)
         self._limiter = _Limiter(self.limits, self._period)
         self._steps = int(np.clip(np.ceil(self._period / _STEP_TIME), 1, _MAX_STEPS))
-        self._smoothing = 1 - np.exp(-self._period / _SPEED_TIME)
+        self._smoothing = float(1 - np.exp(-self._period / _SPEED_TIME))
+        self._reach = self.limits.velocity * self._period
         self._random = np.random.default_rng(0)
         self._lower, self._upper = self.limits.position.T
         self.reset(np.clip(follower.home, self._lower, self._upper))
@@ -162,7 +169,9 @@ class Teleoperator:
         """Positions [m] and rotations that the follower's hands are driven to, in its base frame; None without one."""
         if self._goal is None:
             return None
-        return self._goal.position * self._rows[1].unit, np.swapaxes(self._goal.axes, 1, 2)
+        pairs = len(self._pairs)
+        axes = self._goal.hands[pairs:].reshape(pairs, 3, 3)
+        return self._goal.hands[:pairs] * self._rows[1].unit, np.swapaxes(axes, 1, 2)
 
     def step(self, leader_qpos: Any, gripper: float | None = None, time: float | None = None) -> FollowerCommand:
         """The command of the next tick.
@@ -187,47 +196,54 @@ class Teleoperator:
             return FollowerCommand(self._limiter.step(self._path, self._speed), opening, status)
         self._advance(self._goal)
         qpos = self._limiter.step(self._path, self._speed)
-        rows = self._rows[1](np.stack([self._posture, qpos]))
-        self._posture_rows = Rows(*(x[:1] for x in rows))
+        rows = self._rows[1](np.array([self._posture, qpos]))
+        self._posture_rows = rows[:1]
         return FollowerCommand(qpos, opening, self._status(*self._pose.errors(self._goal, rows)))
 
     def _goal_of(self, sample: np.ndarray) -> Goal:
         """The goal of a sample of the leader."""
         leader, follower = self._rows
-        rows = leader(sample[None])
-        position, axes = (x[0, self._pairs[:, 0]] for x in leader.hand(rows))
-        position, axes = self._scale * leader.unit * position @ self._to_base.T, axes @ self._to_base.T
+        rows, pairs = leader(sample[None])[0].dot(self._to_base), len(self._pairs)
+        hands = rows.take(self._leader_hands, axis=0)
+        position, axes = hands[:pairs], hands[pairs:]  # parts of the same array
+        position *= self._factor
         if not self._is_relative:
-            position, axes = position - self._origin, self._mirrored * axes
-        else:
-            if self._anchor is None:
-                start = (x[0, self._pairs[:, 1]] for x in follower.hand(follower(self._path[None])))
-                self._anchor = position, axes, *start
-            position_then, axes_then, start, start_axes = self._anchor
-            position = follower.unit * start + position - position_then
-            # Rows are axes: the rotation since then, R R_then^T, acts on each axis of the start.
-            axes = start_axes @ (np.swapaxes(axes_then, 1, 2) @ axes)
-        return self._pose.goal(rows, position / follower.unit, axes, self._to_base)
+            position -= self._origin
+            if self._mirrored is not None:
+                axes *= self._mirrored
+            return self._pose.goal(rows, hands)
+        if self._anchor is None:
+            self._anchor = hands.copy(), follower(self._path[None])[0].take(self._follower_hands, axis=0)
+        then, start = self._anchor
+        position += start[:pairs] - then[:pairs]
+        # Rows are axes: the rotation since then, R R_then^T, acts on each axis of the start.
+        of_pairs = (x.reshape(pairs, 3, 3) for x in (start[pairs:], then[pairs:], axes))
+        of_start, of_then, of_now = of_pairs
+        axes[:] = (of_start @ (of_then.swapaxes(1, 2) @ of_now)).reshape(-1, 3)
+        return self._pose.goal(rows, hands)
 
     def _advance(self, goal: Goal) -> None:
         """Moves the posture towards the goal, and the path towards the posture."""
-        reach = self.limits.velocity * self._period
-        lower, upper = np.maximum(self._lower, self._posture - reach), np.minimum(self._upper, self._posture + reach)
-        posture, rows = self._posture[None], self._posture_rows
+        reach, posture, rows, last = self._reach, self._posture[None], self._posture_rows, self._posture
+        lower, upper = np.maximum(self._lower, last - reach), np.minimum(self._upper, last + reach)
         for _ in range(self._steps):
-            posture, _ = self._pose.step(goal, posture, lower, upper, NEAR, self._left, rows)
+            posture = self._pose.step(goal, posture, lower, upper, NEAR, self._left, rows)
             rows = None
-        moved, self._posture = posture[0] - self._posture, posture[0]
+        self._posture, follows = posture[0], self._path is last
+        moved = self._posture - last
+        fraction = float(np.abs(moved / reach).max())
         # A path that goes as fast as it may ends at once, where the command must be able to stop.
-        is_free = self._is_near and bool(np.all(np.abs(moved) < _FREE * reach))
-        self._speed = self._speed + self._smoothing * (moved / self._period - self._speed) if is_free else 0 * moved
+        is_free = self._is_near and fraction < _FREE
+        kept = 1 - self._smoothing
+        self._speed = kept * self._speed + self._smoothing / self._period * moved if is_free else 0 * moved
         self._search(goal)
         if self._lanes is not None and not self._is_near:
             return  # where an approach goes is not known yet
-        away = self._posture - self._path
-        fraction = np.max(np.abs(away) / (reach * (1.0 if self._is_near else _APPROACH)))
-        self._is_near |= fraction <= 1
-        self._path = self._posture if fraction <= 1 else self._path + away / fraction
+        if not (follows and self._is_near):
+            moved = self._posture - self._path
+            fraction = float(np.abs(moved / reach).max()) / (1.0 if self._is_near else _APPROACH)
+            self._is_near |= fraction <= 1
+        self._path = self._posture if fraction <= 1 else self._path + moved / fraction
 
     def _search(self, goal: Goal) -> None:
         """Searches other branches at the start of an approach, and while the hand is not reached, a step in a tick."""
@@ -240,10 +256,11 @@ class Teleoperator:
                 return  # on its way
             self._lanes, self._rounds = self._spread(self._posture), 0
         box = np.maximum(self._lower, self._lanes - 0.5), np.minimum(self._upper, self._lanes + 0.5)
-        self._lanes, cost = self._pose.step(goal, self._lanes, *box, FAR)
+        self._lanes = self._pose.step(goal, self._lanes, *box, FAR)
         self._rounds += 1
         if self._rounds % _ROUNDS:
             return
+        cost = self._pose.cost(goal, self._rows[1](self._lanes))
         if not self._is_near:  # a wrist that is flipped is as near to the leader, but may soon be at a limit
             low, high = self._lower, self._upper
             cost = cost + _ROOM * np.mean(((2 * self._lanes - low - high) / (high - low)) ** 2, axis=1)
@@ -263,14 +280,15 @@ class Teleoperator:
     def _leads_there(self, goal: Goal, posture: np.ndarray, cost: float) -> bool:
         """Whether another branch is better, and the hand does not go away from its goal on the straight way there."""
         line = self._posture + np.linspace(0, 1, _LINE)[:, None] * (posture - self._posture)
-        costs = self._pose.pulls(goal, self._rows[1](line))[3]
+        costs = self._pose.cost(goal, self._rows[1](line))
         return cost < 0.5 * costs[0] and costs.max() <= _DETOUR * costs[0]
 
-    def _status(self, positions: np.ndarray, rotations: np.ndarray) -> TeleoperationStatus:
+    def _status(self, positions: Sequence[float], rotations: Sequence[float]) -> TeleoperationStatus:
         """What the follower does, and why, from errors [m, rad] of the hands of the posture and of the command."""
-        reached = (positions <= _TOLERANCE[0]) & (rotations <= _TOLERANCE[1])
-        self._is_reached, self._left = bool(reached[0]), positions[0] / self._rows[1].unit
-        errors, reason = (1e3 * float(positions[1]), float(np.degrees(rotations[1]))), self._samples.reason
+        near, turned = _TOLERANCE
+        reached = [x <= near and y <= turned for x, y in zip(positions, rotations, strict=True)]
+        self._is_reached, self._left = reached[0], positions[0] / self._rows[1].unit
+        errors, reason = (1e3 * positions[1], math.degrees(rotations[1])), self._samples.reason
         if self._samples.age > _TIMEOUT:
             return TeleoperationStatus("holding", reason or f"no sample for {self._samples.age:.1f} s", *errors)
         if not self._is_near:
@@ -329,7 +347,7 @@ class _Samples:
         sample = np.asarray(qpos, float)
         if sample.shape != (self._joints,):
             raise ValueError(f"leader_qpos: expected {self._joints} angles [rad], got shape {sample.shape}")
-        if not np.isfinite(sample).all() or (time is not None and not np.isfinite(time)):
+        if not math.isfinite(sample.dot(sample)) or (time is not None and not math.isfinite(time)):
             self.reason = "ignored a sample that is not finite"
         elif time is not None and self._is_old(time):
             self.reason = "ignored a sample that is not newer than the last one"
@@ -349,8 +367,11 @@ class _Samples:
 
     def _is_jump(self, sample: np.ndarray) -> bool:
         reach = _MAX_SPEED * max(self.age, self._period)
-        if self._last is None or np.abs(wrap_angles(sample - self._last, self._continuous)).max() <= reach:
+        if self._last is None:
             return False
+        moved = sample - self._last
+        if moved.dot(moved) <= reach**2 or np.abs(wrap_angles(moved, self._continuous)).max() <= reach:
+            return False  # the norm is checked first because it is fast
         before, self._jumped = self._jumped, sample
         near = before is not None and np.abs(wrap_angles(sample - before, self._continuous)).max() <= reach
         self._agreeing = self._agreeing + self._period if near else 0.0

@@ -157,12 +157,12 @@ class HandDrag:
         start, reach = np.asarray(qpos, float), finite_velocity_limit(self._arm) * dt
         lower, upper = np.asarray(self._arm.joint_range).T
         lower, upper = np.maximum(lower, start - reach), np.minimum(upper, start + reach)
-        rows = self._rows(start[None])
-        position, axes = (x[0].copy() for x in self._rows.hand(rows))
-        position[0], axes[0] = self.goal[:3, 3] / self._rows.unit, self.goal[:3, :3].T
-        goal, pose = self._pose.goal(rows, position, axes, np.eye(3)), start[None]
+        rows, number = self._rows(start[None])[0], self._rows.hands
+        hands = rows[self._rows.hand_rows(np.arange(number))]
+        hands[0], hands[number : number + 3] = self.goal[:3, 3] / self._rows.unit, self.goal[:3, :3].T
+        goal, pose = self._pose.goal(rows, hands), start[None]
         for _ in range(_STEPS):
-            pose, _ = self._pose.step(goal, pose, lower, upper)
+            pose = self._pose.step(goal, pose, lower, upper)
         if np.abs(pose[0] - start).max() < _AT_HAND:
             self.goal = None
         return pose[0].astype(qpos.dtype)

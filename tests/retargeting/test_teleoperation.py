@@ -53,30 +53,35 @@ def assert_within_limits(operator, path):
 def test_rows_are_the_kinematics_and_their_derivatives(arms):
     arm, step = arms[1], 1e-6
     rows, qpos = ArmRows(arm), np.random.default_rng(0).uniform(-1, 1, (3, arm.num_joints))
-    frames, (position, axes) = mimic.hand_frames(arm, qpos), rows.hand(rows(qpos))
-    np.testing.assert_allclose(rows.unit * position, frames.position, atol=1e-6)  # of single precision
-    np.testing.assert_allclose(np.swapaxes(axes, 2, 3), frames.rotation, atol=1e-6)
+    frames, table = mimic.hand_frames(arm, qpos), rows(qpos)
+    hand = table[:, rows.hand_rows(np.array([0]))]
+    np.testing.assert_allclose(rows.unit * hand[:, :1], frames.position, atol=1e-6)  # of single precision
+    np.testing.assert_allclose(np.swapaxes(hand[:, None, 1:], 2, 3), frames.rotation, atol=1e-6)
     states = mimic.link_states(arm, qpos)
-    np.testing.assert_allclose(rows(qpos).moving[:, : arm.num_links], states.position, atol=1e-6)
-    columns = rows.jacobian(rows(qpos))
+    np.testing.assert_allclose(table[:, rows.points], states.position, atol=1e-6)
+    np.testing.assert_allclose(table[:, rows.directions], states.direction, atol=1e-6)
+    columns = rows.jacobian(table)
     for joint in range(arm.num_joints):
         change = step * np.eye(arm.num_joints)[joint]
-        numeric = (rows(qpos + change).moving - rows(qpos - change).moving) / (2 * step)
-        np.testing.assert_allclose(np.swapaxes(columns[:, joint], 1, 2), numeric, atol=1e-8)
+        numeric = (rows(qpos + change) - rows(qpos - change))[:, rows.moving] / (2 * step)
+        np.testing.assert_allclose(columns[:, joint], numeric, atol=1e-8)
 
 
 def test_posture_is_that_of_imitate_pose(arms):
     metric = mimic.metric.config.MetricConfig().build(*arms)
     expected = mimic.imitate_pose(*arms, READY + SWAY, **metric.arguments, hand="exact")
-    rows = [ArmRows(arm) for arm in arms]
-    pose = LivePose(*rows, matched_hands(*arms), metric)
-    of_leader = rows[0](READY[None] + SWAY)
-    position, axes = rows[0].hand(of_leader)
-    goal = pose.goal(of_leader, position[0] * rows[0].unit / rows[1].unit, axes[0], np.eye(3))
+    leader, follower = (ArmRows(arm) for arm in arms)
+    pairs = matched_hands(*arms)
+    pose = LivePose(leader, follower, pairs, metric)
+    of_leader = leader(READY[None] + SWAY)[0]
+    hands = of_leader[leader.hand_rows(pairs[:, 0])]
+    hands[: len(pairs)] *= leader.unit / follower.unit
+    goal = pose.goal(of_leader, hands)
     lower, upper = arms[1].joint_range.T
     qpos = np.random.default_rng(0).uniform(lower, upper, (24, 6))
     for _ in range(40):
-        qpos, cost = pose.step(goal, qpos, np.maximum(lower, qpos - 0.5), np.minimum(upper, qpos + 0.5), FAR)
+        qpos = pose.step(goal, qpos, np.maximum(lower, qpos - 0.5), np.minimum(upper, qpos + 0.5), FAR)
+    cost = pose.cost(goal, follower(qpos))
     np.testing.assert_allclose(qpos[cost.argmin()], expected.qpos, atol=2e-3)
 
 
