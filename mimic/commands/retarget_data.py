@@ -29,6 +29,7 @@ from mimic.retargeting.self_collision import make_contacts
 from mimic.runs.files import finite, written_atomically
 
 _REPORT, _PICTURE = "report.json", "certificate.png"
+_WARNING = "warning"  # how notes begin that are printed before the work
 _SHOWN = 12  # episodes in the table; those that fail come first
 _POSITION_ALONE = 0.5  # of the frames that fail: with so many whose hand is at its place, the rotation is what fails
 
@@ -72,6 +73,7 @@ def prepare_data_set(config: RetargetConfig) -> Callable[[], int]:
 
     def run() -> int:
         console = Console()
+        _print_lines(console, [note for note in data.notes if note.startswith(_WARNING)])
         used = _with_base(setting, config.base, data, console)
         motions: dict[str, dict[str, Motion]] = {entry: {} for entry in data.motions}
         certificates = {}
@@ -164,6 +166,7 @@ def _report(
         "failing": config.failing,
         "episodes": rows,
         "not_retargeted": dict(data.faults),
+        "notes": list(data.notes),
     }
 
 
@@ -204,9 +207,14 @@ def _print(
     lines += [f"not retargeted: {name}: {fault}" for name, fault in list(data.faults.items())[:_SHOWN]]
     base = setting.base or [0.0, 0.0, 0.0, 0.0]
     lines.append(f"base of {setting.learner.name} in that of {setting.expert.name} [m, rad]: {base}")
-    lines += [*data.notes, f"commands: {', '.join(data.commands) or 'none'}"]
+    lines += [note for note in data.notes if not note.startswith(_WARNING)]
+    lines += [f"commands: {', '.join(data.commands) or 'none'}"]
     lines.append(f"gripper, as in the source: {', '.join(data.gripper)}" if data.gripper else "gripper: none")
-    for line in [*lines, *written, *filter(None, [_help_line(certificates, setting)])]:
+    _print_lines(console, [*lines, *written, *filter(None, [_help_line(certificates, setting)])])
+
+
+def _print_lines(console: Console, lines: Sequence[str]) -> None:
+    for line in lines:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 

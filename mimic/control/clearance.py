@@ -51,13 +51,18 @@ def clearance(qpos: Array, arm: ClearanceConstants, xp: Any) -> Array:
       xp: array library.
     """
     start, end = capsule_axes(qpos, arm, xp)
-    i, j = arm.pairs[:, 0], arm.pairs[:, 1]
-    axes = start[..., i, :], end[..., i, :], start[..., j, :], end[..., j, :]
-    distances = _segment_distances(*axes, xp) - (arm.radius[i] + arm.radius[j])
+    distances = pair_distances(start, end, arm, xp)
     lowest = xp.minimum(start[..., arm.above, 2], end[..., arm.above, 2])
     heights = lowest - (arm.radius[arm.above] + arm.floor_height)
     nothing = xp.full_like(qpos[..., :1], _FAR)
     return xp.concatenate([distances, heights, nothing], axis=-1).min(axis=-1)
+
+
+def pair_distances(start: Array, end: Array, arm: ClearanceConstants, xp: Any) -> Array:
+    """Distances [..., pairs] of the pairs of capsules [m], negative where they intersect; see `capsule_axes`."""
+    i, j = arm.pairs[:, 0], arm.pairs[:, 1]
+    axes = start[..., i, :], end[..., i, :], start[..., j, :], end[..., j, :]
+    return _segment_distances(*axes, xp) - (arm.radius[i] + arm.radius[j])
 
 
 def capsule_axes(qpos: Array, arm: ClearanceConstants, xp: Any) -> tuple[Array, Array]:

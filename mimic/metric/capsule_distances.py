@@ -1,5 +1,7 @@
 """Distances of the capsules around an arm's links, from each other and over poses."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,8 @@ from jaxtyping import Array, Bool, Float
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.base import spatial
+from mimic.control import clearance
+from mimic.control.clearance import ClearanceConstants
 from mimic.metric.kinematics import joint_frames
 
 _SMOOTHING = 1e-4  # m, of the distance of crossing segments, whose second derivative is infinite without
@@ -39,18 +43,50 @@ def pair_distances(capsules: Capsules, start: Array, end: Array) -> Float[Array,
 
 def changing_pairs(arm: Embodiment, capsules: Capsules) -> Bool[np.ndarray, " pairs"]:
     """Whether the joints change the distance of each pair; two capsules of a Panda's wrist are always 2.0 cm apart."""
-    if not capsules.pairs:
-        return np.zeros(0, bool)
     qpos = np.random.default_rng(0).uniform(-np.pi, np.pi, (_RANDOM_POSES, arm.num_joints))
-    with jax.ensure_compile_time_eval():
-        of_pose = jax.jit(jax.vmap(lambda q: pair_distances(capsules, *capsule_axes(arm, capsules, q))))
-        return np.ptp(np.asarray(of_pose(jnp.asarray(qpos, jnp.float32))), axis=0) > _CHANGE
+    constants = clearance_constants(arm, capsules, pairs=capsules.pairs)
+    axes = clearance.capsule_axes(qpos, constants, np)  # by NumPy, which has nothing to compile
+    return np.ptp(clearance.pair_distances(*axes, constants, np), axis=0) > _CHANGE
 
 
 def colliding_pairs(arm: Embodiment, capsules: Capsules) -> list[tuple[int, int]]:
     """The capsules' pairs whose distance the joints change."""
     changes = changing_pairs(arm, capsules)
     return [pair for pair, is_changing in zip(capsules.pairs, changes, strict=True) if is_changing]
+
+
+def clearance_constants(
+    arm: Embodiment,
+    capsules: Capsules,
+    floor_height: float = 0.0,
+    pairs: Sequence[tuple[int, int]] | None = None,
+) -> ClearanceConstants:
+    """The constants of an arm's clearance.
+
+    It is the minimum distance of the capsules' pairs that joints change, and of the capsules from the floor, except
+    those on the base and on the joints at the base.
+
+    Args:
+      arm: the embodiment.
+      capsules: from `fit_capsules`, of the same arm.
+      floor_height: height of the floor in the base frame [m].
+      pairs: of capsules, in place of those that joints change.
+    """
+    pairs = colliding_pairs(arm, capsules) if pairs is None else pairs
+    lengths = arm.joint_axis, arm.joint_anchor, capsules.start, capsules.end, capsules.radius, floor_height
+    axis, anchor, start, end, radius, floor = (np.asarray(x, np.float32) for x in lengths)
+    return ClearanceConstants(
+        parent=np.array(arm.joint_parent),
+        axis=axis,
+        anchor=anchor,
+        joint=np.array(capsules.joint),
+        start=start,
+        end=end,
+        radius=radius,
+        pairs=np.array(pairs, int).reshape(-1, 2),
+        above=np.flatnonzero(~np.array(capsules.near_base)),
+        floor_height=floor,
+    )
 
 
 def segment_distance(

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.motions.cleaning import OVERSHOOT, Notes, cleaned
+from mimic.motions.evidence import doubts
 from mimic.motions.formats.episodes import Motion, Recording
 from mimic.motions.formats.hdf5 import is_hdf5
 from mimic.motions.formats.hdf5_rewriting import rewrite_hdf5
@@ -19,6 +20,8 @@ from mimic.motions.formats.table_rewriting import rewrite_archive, rewrite_folde
 from mimic.motions.formats.tables import TABLES, is_folder_of_tables
 from mimic.motions.importing import read_source, source_names
 from mimic.motions.units import find_unit, from_rad, in_rad
+
+_FAR_BEYOND = 0.1  # rad, more than zeros of real arms differ from those of their models
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +93,12 @@ def read_data_set(
     for name in recording.commanded:
         found = in_rad(recordings[name], unit, ranges).motions
         every[name] = {episode: _near(found[episode], motion) for episode, motion in motions.items()}
-    notes = tuple(note for note in (*recording.notes, line, _beyond(motions, arm.joint_names, ranges)) if note)
+    raw = {name: in_rad(recording, unit, ranges).motions[name] for name in motions}
+    suspicious = [
+        _beyond(motions, arm.joint_names, ranges),
+        *doubts(arm, raw, {name: every[name] for name in recording.commanded}, recording.joints),
+    ]
+    notes = tuple(filter(None, (*recording.notes, line, *suspicious)))
     return DataSet(path, entry, every, joint_names, faults, recording.gripper, unit, rate is None, notes)
 
 
@@ -118,6 +126,8 @@ def _beyond(motions: Mapping[str, Motion], names: Sequence[str], ranges: np.ndar
     beyond = np.maximum(ranges[:, 0] - low, high - ranges[:, 1])
     joint = int(np.argmax(beyond))
     text = f"{names[joint]} is up to {beyond[joint]:.2g} rad beyond the range of the expert's model"
+    if beyond[joint] > _FAR_BEYOND:
+        return f"warning: {text}: another arm, other units, or the order, signs or zeros of joints?"
     return text if beyond[joint] > OVERSHOOT else ""
 
 

@@ -39,17 +39,20 @@ def find_unit(
     Raises:
       ValueError: the values fit no unit, or several.
     """
+    angles = np.concatenate([motion.qpos for motion in recording.motions.values()])
+    if unknown := [joint_names[joint] for joint in np.flatnonzero(~np.isfinite(angles).any(axis=0)).tolist()]:
+        raise ValueError(f"source: {path!r} has no number as angle of {', '.join(unknown)}")
+    low, high = np.nanmin(angles, axis=0), np.nanmax(angles, axis=0)
+    excursion, joint = float(np.max(high - low)), int(np.argmax(high - low))
     if units:
         check_choice("units", units, UNITS)
-        return units, ""
+        small = units != "rad" and 0 < excursion < _SMALLEST
+        return units, f"warning: no joint moves by more than {excursion:.2g} {units}; are they rad?" if small else ""
     if recording.unit:
         return recording.unit, ""
     if recording.robot is None:
         return "rad", "units: rad, as is usual for such sources; units= states others"
-    low, high = (extreme([extreme(motion.qpos, axis=0) for motion in recording.motions.values()], axis=0)
-                 for extreme in (np.nanmin, np.nanmax))  # fmt: skip
     fitting = {unit: line for unit in UNITS if (line := _fit(unit, low, high, joint_range, recording))}
-    excursion, joint = float(np.max(high - low)), int(np.argmax(high - low))
     is_servo = recording.robot.lower().startswith(_SERVO_ROBOTS)
     if "rad" in fitting and excursion <= (_SMALLEST if is_servo else _SMALL):
         fitting = {"rad": fitting["rad"]}

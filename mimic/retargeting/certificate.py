@@ -4,23 +4,23 @@ import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import motion_limits
+from mimic.base.compilation import compiled_once
+from mimic.control import clearance as control_clearance
+from mimic.metric.capsule_distances import clearance_constants
 from mimic.metric.kinematics import hand_frames
-from mimic.retargeting.clearance import make_clearance
+from mimic.retargeting.exact_chunks import by_chunks
 
 POSITION, ROTATION = 1e-3, np.radians(0.5)  # m, rad: a hand within both is where the expert's is
 _NO_FLOOR = -1e3  # m; what the arm stands on is not known
 _AT_LIMIT, _AT_RANGE = 0.999, 1e-3  # fraction of the velocity limit; rad from the end of a range
 _TOUCHING = -0.01  # m, where contacts are not known: capsules are larger than the shapes that they contain
 _ROUNDING = 1e-5  # rad, relative: of single precision
-_CHUNK = 1024  # frames of a compiled function
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +106,9 @@ def certify(
     margins = np.minimum(qpos - lower, upper - qpos)
     steps = np.abs(np.diff(qpos, axis=0)) / largest_jump
     steps = np.concatenate([steps, np.zeros((1, qpos.shape[1]))])  # after the last frame the arm stands
-    clearance = np.full(len(qpos), np.nan) if capsules is None else _clearance(learner, capsules, qpos)
+    clearance = np.full(len(qpos), np.nan)
+    if capsules is not None:
+        clearance = control_clearance.clearance(qpos, clearance_constants(learner, capsules, _NO_FLOOR), np)
     touches = clearance < _TOUCHING
     if contacts is not None:
         touches = clearance < 0
@@ -136,24 +138,26 @@ def hand_errors(
     expert: Embodiment, learner: Embodiment, expert_qpos: np.ndarray, qpos: np.ndarray, base: Sequence[float] | None
 ) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]]:
     """Distances [m] and angles [rad] between the hands; of several hands the largest. See `certify`."""
-    hands, learner_hands = (
-        jax.tree.map(lambda x: np.asarray(x, float), hand_frames(arm, jnp.asarray(values, jnp.float32)))
+    (hand, rotation), (own, own_rotation) = (
+        by_chunks(_hands(arm), np.asarray(values, np.float32))
         for arm, values in ((expert, expert_qpos), (learner, qpos))
     )
     x, y, z, yaw = (0.0, 0.0, 0.0, 0.0) if base is None else base
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-    position = learner_hands.position @ turn.T + [x, y, z]
-    difference = np.swapaxes(hands.rotation, -1, -2) @ turn @ learner_hands.rotation
+    difference = np.swapaxes(rotation, -1, -2) @ turn @ own_rotation
     skew = difference - np.swapaxes(difference, -1, -2)
     sine = np.sqrt(np.sum(skew**2, axis=(-1, -2)) / 8)
     cosine = (np.trace(difference, axis1=-1, axis2=-2) - 1) / 2
-    distance = np.linalg.norm(hands.position - position, axis=-1)
+    distance = np.linalg.norm(hand - own @ turn.T - [x, y, z], axis=-1)
     return distance.max(axis=-1), np.arctan2(sine, cosine).max(axis=-1)
 
 
-def _clearance(arm: Embodiment, capsules: Capsules, qpos: np.ndarray) -> Float[np.ndarray, " frames"]:
-    """The clearance between the links of each pose [m]."""
-    clearance = jax.jit(jax.vmap(make_clearance(arm, capsules, _NO_FLOOR)))
-    rows = np.minimum(np.arange(-(-len(qpos) // _CHUNK) * _CHUNK), len(qpos) - 1)
-    chunks = np.asarray(qpos, np.float32)[rows].reshape(-1, _CHUNK, qpos.shape[1])
-    return np.concatenate([np.asarray(clearance(chunk), float) for chunk in chunks])[: len(qpos)]
+@compiled_once
+def _hands(arm: Embodiment) -> Callable[[Array], tuple[Array, Array]]:
+    """The function from poses to positions and rotations of the hands."""
+
+    def frames(qpos: Array) -> tuple[Array, Array]:
+        hands = hand_frames(arm, qpos)
+        return hands.position, hands.rotation
+
+    return frames

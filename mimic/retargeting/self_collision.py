@@ -49,10 +49,10 @@ def make_contacts(
 
     def touching(qpos: np.ndarray) -> set[tuple[int, int]]:
         data.qpos[address] = qpos
-        mujoco.mj_fwdPosition(model, data)
-        pairs = model.geom_bodyid[np.array([contact.geom for contact in data.contact], int).reshape(-1, 2)]
-        depths = [contact.dist for contact in data.contact]
-        return {(int(a), int(b)) for (a, b), depth in zip(pairs, depths, strict=True) if depth < 0}
+        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_collision):  # what collisions need
+            compute(model, data)
+        pairs = model.geom_bodyid[data.contact.geom[data.contact.dist < 0]]
+        return set(map(tuple, pairs.tolist()))
 
     always = touching(np.asarray(arm.embodiment.home, float))
     return lambda qpos: np.array([bool(touching(pose) - always) for pose in qpos], bool)

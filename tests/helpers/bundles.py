@@ -15,8 +15,8 @@ from mimic.control.clearance import ClearanceConstants
 from mimic.control.joint_control import JointParameters, action_size
 from mimic.deploy.bundle import load_bundle, write_bundle
 from mimic.envs import env_config
+from mimic.metric.capsule_distances import clearance_constants
 from mimic.physics.plant import make_plant
-from mimic.retargeting.clearance import clearance_constants
 from mimic.trainers.export.onnx_model import to_onnx
 
 ON_FLOOR = np.array([0, 1.7, 0, -0.9, 0, 1.57, 0.785])  # poses in which a Panda touches the floor, and itself

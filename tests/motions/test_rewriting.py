@@ -260,7 +260,7 @@ def test_an_episode_that_needs_repair_is_a_fault(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda state: state * np.nan, "no sample whose time and angles are numbers"),
+        (lambda state: state * np.nan, "no number as angle of joint1, joint2, joint3"),
         (lambda state: state[:, :3], "expected .* numbers or more in a frame"),
         (lambda state: state[:, :2], "numbers"),
     ],

@@ -11,8 +11,8 @@ import pytest
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.control.clearance import clearance as control_clearance
-from mimic.metric.capsule_distances import capsule_axes, changing_pairs, pair_distances
-from mimic.retargeting.clearance import clearance_constants, make_clearance
+from mimic.metric.capsule_distances import capsule_axes, changing_pairs, clearance_constants, pair_distances
+from mimic.retargeting.clearance import make_clearance
 from tests.helpers.virtual_robots import model
 
 CONFIGS = {"panda": ArmConfig(), "locked": ArmConfig(locked=[3, 6, 7]), "two arms": ArmConfig(model="panda_pair")}

@@ -12,10 +12,12 @@ from mimic.motions.formats.episodes import Motion, Recording
 from mimic.motions.formats.names import select
 
 _SIZES = {0: (7, 6), 2: (1, 1), 3: (1, 1)}  # columns of qpos and qvel by MuJoCo's joint type: free, slide, revolute
+_HANDS = "eef_pos", "ee_pos", "tcp_pos", "hand_pos"  # arrays of positions of the hand
 _NUMBERS = "biuf"  # kinds of NumPy's types
 _FORMS = {  # of the arrays of an npz file: kinds of their types, and their numbers of dimensions
     "qpos": (_NUMBERS, (2,)), "qvel": (_NUMBERS, (2,)), "joint_names": ("U", (0, 1)), "frequency": (_NUMBERS, (0,)),
     "dt": (_NUMBERS, (0,)), "jnt_type": (_NUMBERS, (1,)), "split_points": (_NUMBERS, (0, 1)),
+    **dict.fromkeys(_HANDS, (_NUMBERS, (2,))),
 }  # fmt: skip
 
 
@@ -36,6 +38,9 @@ def read_archive(path: Path, joints: Sequence[str]) -> Recording:
             raise ValueError(
                 f"source: {key} in {str(path)!r} must be {expected} for its joints, got {list(values.shape)}"
             )
+    for key in filter(content.__contains__, _HANDS):
+        if content[key].shape[0] != len(qpos) or content[key].shape[1] < 3:
+            raise ValueError(f"source: {key} in {str(path)!r} must be [{len(qpos)}, 3], got {list(content[key].shape)}")
     rate = content["dt"] if "dt" in content else content["frequency"]
     if not 1 / MAX_VALUE <= float(rate) <= MAX_VALUE:
         raise ValueError(
@@ -49,6 +54,7 @@ def read_archive(path: Path, joints: Sequence[str]) -> Recording:
         columns[:, angle_at[indices]],
         None if qvel is None else np.asarray(qvel, float)[:, velocity_at[indices]],
         columns[:, angle_at[gripper_at]] if gripper_at else None,
+        next((np.asarray(content[key], float)[:, :3] for key in _HANDS if key in content), None),
     )
     points = np.atleast_1d(content.get("split_points", (0, len(qpos))))
     bounds = [int(point) if np.isfinite(point) else -1 for point in points[: len(qpos) + 2]]
@@ -64,11 +70,8 @@ def read_archive(path: Path, joints: Sequence[str]) -> Recording:
 
 
 def _npz_content(path: Path) -> dict[str, Any]:
-    keys = ("qpos", "qvel", "joint_names", "frequency", "dt", "jnt_type", "split_points")
     try:
-        content: dict[str, Any] = dict(
-            read_arrays(path, keys)
-        )  # pickled arrays, as LocoMuJoCo's metadata, are not read
+        content: dict[str, Any] = dict(read_arrays(path, _FORMS))  # not pickled ones, as LocoMuJoCo's metadata
     except ValueError as error:
         raise ValueError(f"source: {str(path)!r} cannot be read as an npz file of motions: {error}") from error
     lacking = [key for key in ("qpos", "joint_names") if key not in content]

@@ -38,17 +38,20 @@ class Motion(NamedTuple):
       qpos: [samples, joints] angles, in rad unless a `Recording` says otherwise.
       qvel: [samples, joints] the same per second; None if the source has no velocities.
       gripper: [samples, channels] joints or opening of the gripper, as the source has them; None without a gripper.
+      hand: [samples, 3] positions of the hand in any axes; None where the source has none.
+      hand_step: [samples, 3] commanded steps of the hand in the axes of the base, in any unit; None without.
     """
 
     time: Float[np.ndarray, " samples"]
     qpos: Float[np.ndarray, "samples joints"]
     qvel: Float[np.ndarray, "samples joints"] | None
     gripper: Float[np.ndarray, "samples channels"] | None = None
+    hand: Float[np.ndarray, "samples 3"] | None = None
+    hand_step: Float[np.ndarray, "samples 3"] | None = None
 
     def take(self, index: Any) -> "Motion":
         """The samples with these indices."""
-        optional = (None if values is None else values[index] for values in (self.qvel, self.gripper))
-        return Motion(self.time[index], self.qpos[index], *optional)
+        return Motion(*(None if values is None else values[index] for values in self))  # type: ignore[arg-type]
 
 
 class Recording(NamedTuple):

@@ -11,7 +11,7 @@ import numpy as np
 
 from mimic.base.files import check_file, read_text
 from mimic.motions.formats.episodes import MAX_NUMBERS, Motion, Recording, package_error
-from mimic.motions.formats.names import Selection, parse_column, select
+from mimic.motions.formats.names import Selection, hand_position, parse_column, select
 from mimic.motions.formats.tables import TIMES, seconds
 
 SUFFIXES = (".hdf5", ".h5")
@@ -22,6 +22,7 @@ STATES, MODEL = "states", "model_file"  # robosuite's: MuJoCo's time, qpos and q
 OTHER_COPIES = "next_obs"  # robomimic's: the observations of the next sample
 _RATES = ("control_freq", "fps", "frequency", "hz", "rate")  # attributes; in Hz
 _ENVIRONMENTS = ("env_args", "env_info", "env_kwargs")  # attributes with such keys, as JSON
+_STEP_CONTROLLERS, ACTIONS = ("OSC", "IK"), "actions"  # robosuite's types of controllers of the hand
 _SIZES = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}  # of qpos and qvel, by MuJoCo's joints
 
 
@@ -129,8 +130,8 @@ def episodes(file: Any) -> Iterator[tuple[str, Episode]]:
 def _entries(episode: Episode, layout: _Layout | None) -> dict[str, list[str]]:
     """The data sets of angles with the names of their columns: numbers from 1, where nothing names them."""
     entries = {
-        name: [str(number) for number in range(1, (item.shape[1] if item.ndim == 2 else 1) + 1)]
-        for name, item in episode.sets.items()
+        name: [str(number) for number in range(1, width + 1)]
+        for name, width in _widths(episode)
         if _ANGLES.fullmatch(name.split("/")[-1])
     }
     return entries | ({STATES: list(layout.qpos)} if layout else {})
@@ -152,7 +153,42 @@ def _motion(episode: Episode, layout: _Layout | None, selection: Selection, rate
         channels = _columns(episode.sets[selection.gripper_entry])
         at = layout.qpos if selection.gripper_entry == STATES and layout else None
         gripper = channels[:, [at[name] if at else int(name) - 1 for name in selection.gripper]]
-    return Motion(_times(episode, len(qpos), layout, rate), qpos, qvel, gripper)
+    numbered = {name: [str(column) for column in range(1, width + 1)] for name, width in _widths(episode)}
+    found = hand_position(numbered)
+    hand = _columns(episode.sets[found[0]])[:, :3] if found else None
+    return Motion(_times(episode, len(qpos), layout, rate), qpos, qvel, gripper, hand, _hand_steps(episode, len(qpos)))
+
+
+def _widths(episode: Episode) -> Iterator[tuple[str, int]]:
+    """The data sets and their numbers of columns."""
+    yield from ((name, item.shape[1] if item.ndim == 2 else 1) for name, item in episode.sets.items())
+
+
+def _hand_steps(episode: Episode, count: int) -> np.ndarray | None:
+    """The commanded steps of the hand's position; None where the actions are something else."""
+    is_known = step_controller(episode) and ACTIONS in episode.sets and len(episode.sets[ACTIONS]) == count
+    return _columns(episode.sets[ACTIONS])[:, :3] if is_known else None
+
+
+def step_controller(episode: Episode) -> Mapping[str, Any]:
+    """The settings of robosuite's controller whose actions are steps of the hand; empty without one."""
+    for attributes in episode.attributes:
+        for key in _ENVIRONMENTS:
+            content = json.loads(_text(attributes[key])) if key in attributes else None
+            for settings in _mappings(content):
+                is_delta = settings.get("control_delta") or settings.get("input_type") == "delta"
+                if str(settings.get("type")).startswith(_STEP_CONTROLLERS) and is_delta:
+                    return settings
+    return {}
+
+
+def _mappings(content: Any) -> Iterator[Mapping[str, Any]]:
+    """All mappings in a content of JSON."""
+    if isinstance(content, Mapping):
+        yield content
+    inner = content.values() if isinstance(content, Mapping) else content if isinstance(content, list) else ()
+    for item in inner:
+        yield from _mappings(item)
 
 
 def _columns(item: Any) -> np.ndarray:

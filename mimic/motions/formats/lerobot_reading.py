@@ -18,7 +18,7 @@ from mimic.motions.formats.episodes import (
     package_error,
 )
 from mimic.motions.formats.lerobot import DATA_FOLDER, EPISODES_FOLDER, FINAL, INFO
-from mimic.motions.formats.names import UNITS, parse_column, select
+from mimic.motions.formats.names import UNITS, hand_position, parse_column, select
 
 _TIME_TOLERANCE = 1e-4  # s: LeRobot's own, between a timestamp and that of its frame
 _FLOATS = ("float32", "float64")
@@ -65,7 +65,9 @@ def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> Record
     selection = select(str(path), angles, joints, feature, "feature")
     chosen = features[selection.entry]
     beside = selection.gripper_entry or selection.entry
-    episode, frame, time, values, of_gripper = _read_frames(path, (selection.entry, beside))
+    place = hand_position(angles)
+    of_hand = place[0] if place else selection.entry
+    episode, frame, time, values, of_gripper, hands = _read_frames(path, (selection.entry, beside, of_hand))
     order = np.lexsort((frame, episode))
     present, starts = np.unique(episode[order], return_index=True)
     final = _final_values(path, selection.entry)
@@ -80,9 +82,25 @@ def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> Record
         qpos, qvel = (_select(samples, chosen.columns[quantity], selection.joints) for quantity in (ANGLE, VELOCITY))
         assert qpos is not None  # `select` has checked it
         opening = _select(gripper, features[beside].columns[ANGLE], selection.gripper) if selection.gripper else None
-        motions[f"episode {number}"] = Motion(times, qpos, qvel, opening)
+        hand = _select(hands[rows], features[of_hand].columns[ANGLE], place[1]) if place else None
+        hand = hand if hand is None or len(hand) == len(times) else np.vstack([hand, hand[-1:]])
+        motions[f"episode {number}"] = Motion(times, qpos, qvel, opening, hand)
+    notes += _lacking(path, info, len(motions), len(episode))
     robot = str(info.get("robot_type") or "")
     return Recording(motions, unit=chosen.unit, robot=robot, notes=tuple(notes), **selection.facts)
+
+
+def _lacking(path: Path, info: Mapping[str, Any], episodes: int, frames: int) -> list[str]:
+    """Warnings about episodes, frames and videos that the metadata state and the dataset has not."""
+    lines = []
+    for what, count in (("episodes", episodes), ("frames", frames)):
+        stated = info.get(f"total_{what}", count)
+        if stated != count:
+            lines.append(f"warning: {INFO} states {stated} {what}, the data has {count}")
+    for name, form in info["features"].items():
+        if form.get("dtype") == "video" and not any((path / "videos").rglob(f"*{name.split('.')[-1]}*/**/*.mp4")):
+            lines.append(f"warning: the videos of {name} are missing, and so they are in what is written")
+    return lines
 
 
 def _check_info(info: Mapping[str, Any]) -> float:

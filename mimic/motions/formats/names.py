@@ -28,6 +28,12 @@ _COUNTED = re.compile(rf"((?:{'|'.join(_WHOSE)}|motor|servo|axis|dof|[ajq])*)(\d
 _BY_ORDER = "by their order"
 _GRIPPER = re.compile(r"gripper|finger|jaw|knuckle", re.IGNORECASE)
 
+_HAND = re.compile(
+    r"(?:.*[._/ ])?(?:eef|ee|tcp|hand|end_?effector|cartesian)(?:[._/ ]?(?:pos|position|positions|pose|state|xyz))?",
+    re.I,
+)
+_PLACES = re.compile(r"(.*?)[._/ ]?([xyz]|[0-3])", re.IGNORECASE)  # of a hand: their names and axes
+
 
 class Column(NamedTuple):
     """What a column holds.
@@ -187,6 +193,27 @@ def select(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str
     commanded = [] if entry else [other for other in considered if other != name and is_command(other)]
     commanded = [other for other in commanded if find_joints(entries[other], joints)]
     return Selection(name, columns, gripper, gripper_entry, notes, commanded)
+
+
+def hand_position(entries: Mapping[str, Sequence[str]]) -> tuple[str, list[str]] | None:
+    """The entry with positions of the hand, and the names of its three columns; None where no or several have them.
+
+    The entry is called as hands are, as `eef_pos` or `ee_pose`, and has them first; or its columns are, as `tcp_x`.
+    """
+    found = []
+    for entry, names in entries.items():
+        is_hand = bool(_HAND.fullmatch(entry)) and not is_command(entry)
+        places = [
+            (name, match[2].lower())
+            for name in names
+            if (match := _PLACES.fullmatch(name)) and (_HAND.fullmatch(match[1]) or (is_hand and not match[1]))
+        ]
+        chosen = [name for axis in "xyz" for name, place in places if place == axis]
+        if len(chosen) != 3 and len(places) >= 3:
+            chosen = [name for name, _ in places[:3]]
+        if len(chosen) == 3:
+            found.append((entry, chosen))
+    return found[0] if len(found) == 1 else None
 
 
 def is_command(entry: str) -> bool:

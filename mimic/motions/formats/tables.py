@@ -9,7 +9,7 @@ import numpy as np
 
 from mimic.motions.formats.cells import Cells, read_cells
 from mimic.motions.formats.episodes import ANGLE, VELOCITY, Motion, Quantity, Recording
-from mimic.motions.formats.names import QUANTITIES, SECONDS, Column, Selection, parse_column, select
+from mimic.motions.formats.names import QUANTITIES, SECONDS, Column, Selection, hand_position, parse_column, select
 
 TABLES = tuple(suffix + packed for suffix in (".csv", ".tsv", ".txt", ".dat") for packed in ("", ".gz"))
 TIMES = ("time", "times", "t", "timestamp", "timestamps", "stamp", "elapsed", "seconds", "sec")
@@ -72,7 +72,9 @@ def read_table(path: Path, joints: Sequence[str], rate: float | None = None) -> 
         time, line = seconds(path, table[:, time_at], unit if unit in SECONDS else columns[time_at].unit)
     qvel = _velocities(path, table, names[VELOCITY], selection)
     gripper = table[:, [angles[name] for name in selection.gripper]] if selection.gripper else None
-    motion = Motion(time, table[:, [angles[name] for name in selection.joints]], qvel, gripper)
+    found = hand_position({"": list(angles)})
+    hand = table[:, [angles[name] for name in found[1]]] if found else None
+    motion = Motion(time, table[:, [angles[name] for name in selection.joints]], qvel, gripper, hand)
     labels = np.array(content.episodes)
     motions = {label: motion.take(labels == label) for label in dict.fromkeys(content.episodes)}
     unit = next(filter(None, (columns[angles[name]].unit for name in selection.joints)), "")

@@ -19,8 +19,8 @@ from mimic.deploy.bundle import write_bundle
 from mimic.deploy.safety import check_supported
 from mimic.envs.imitation import link_layout, observed_parts
 from mimic.envs.world_env import SENT_ACTIONS, HardwareEnv
+from mimic.metric.capsule_distances import clearance_constants
 from mimic.metric.kinematics import LinkStates, link_states
-from mimic.retargeting.clearance import clearance_constants
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.export.onnx_model import to_onnx

@@ -83,7 +83,7 @@ def test_states_are_read_in_the_order_of_the_model(tmp_path):
     recording = read_hdf5(robosuite(tmp_path / "demo.hdf5"), JOINTS)
     assert list(recording.motions) == ["demo_1", "demo_2", "demo_10"] and recording.gripper == ("gripper0_finger",)
     for motion in recording.motions.values():
-        for values, expected in zip(motion, (TIME, ANGLES, SPEEDS, FINGER), strict=True):
+        for values, expected in zip(motion[:4], (TIME, ANGLES, SPEEDS, FINGER), strict=True):
             np.testing.assert_array_equal(values, expected)
 
 
