@@ -3,6 +3,7 @@
     PYTHON benchmarks/robosuite_replay.py models FOLDER
     python -m benchmarks.transfer FOLDER [--demonstrations DIR] [--arms ur5e ...] [--tasks lift ...] --work DIR
     python -m benchmarks.transfer FOLDER ... --physics PYTHON      # beside it: task success
+    python -m benchmarks.transfer FOLDER ... --data DATA           # beside it: recorded teleoperation, again
 
 PYTHON is one with robosuite. FOLDER/NAME/NAME.xml are its arms with the Panda's gripper. The base is from `base=auto`.
 
@@ -11,6 +12,10 @@ The check is C MuJoCo's, of the written data set: hands are sites of both models
 pairs of links that touch in every pose are left out. `gripper` says whether the gripper's values stay as they were.
 Round trip: of the Panda's lift to an arm with six joints, back, and again to the arm: errors of the Panda's hand, and
 of the joints of both. The Panda has postures to choose from, the other arm has not.
+
+Teleoperation: in DATA/teleop/so101_to_piper an SO-101 leads a Piper joint by joint: the `recorded` mapping. Its
+leader's joints become a data set of the Piper by `hand=near`, within the data sheet's speeds; the leader's hand is what
+both are judged by.
 
 In physics, `success` is robosuite's at the end. Beside mimic: seeded `ssik`, and `copied` joints, from the same base.
 """
@@ -32,17 +37,21 @@ import numpy as np
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.exact_hands import SPEEDS, as_numbers, followed_by_ssik, homogeneous
+from benchmarks.teleoperation import BASE, SPEED, arm, hand_errors, recordings
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.compile_check import VELOCITY_LIMIT
 from mimic.commands.config import RetargetConfig
 from mimic.commands.retarget import prepare_retargeting
 from mimic.envs.config import EnvConfig
+from mimic.motions.importing import read_source
+from mimic.motions.units import in_rad
 from mimic.retargeting.hand_target import placement
 
 ARMS = "ur5e", "iiwa14", "gen3", "jaco", "xarm7"
 TASKS = "lift", "stack", "nut-assembly", "pick-place", "door"
 PAIRS = "learner task frames exact mm:.3f deg:.3f speed:.2f margin_deg:.1f depth_mm:.1f gripper ok seconds:.0f"
 PHYSICS = "learner task method success objects tracking_error_rad:.3f"
+TELEOPERATION = "method episodes frames position_mm_p50:.1f position_mm_p95:.1f hand_direction_deg:.2f"
 _SITE, _EPISODE = "gripper0_right_grip_site", "data/demo_1"
 _WITHOUT_REDUNDANCY = 6  # joints
 _POSES = 100  # random ones, in which links that always touch are found
@@ -164,6 +173,40 @@ def round_trip(options: argparse.Namespace, expert: Model, name: str) -> Row:
     return as_numbers({"learner": name, "mm": row["mm"], "deg": row["deg"], **rad})
 
 
+def teleoperation(options: argparse.Namespace) -> Iterator[Row]:
+    """The recorded leader's episodes as a data set of the Piper, and what the recording's own mapping did."""
+    options.data, options.episodes, out = Path(options.data), None, Path(options.work) / "so101_to_piper"
+    model = ET.parse(options.data / "arms/piper.urdf")
+    for number, speed in enumerate(SPEED["piper"], start=1):
+        limit = model.find(f"joint[@name='joint{number}']/limit")
+        assert limit is not None
+        limit.set("velocity", str(speed))
+    model.write(piper := Path(options.work) / "piper.urdf")
+    env = EnvConfig(
+        expert=ArmConfig(model=str(options.data / "arms/so101/so101_new_calib.urdf")),
+        learner=ArmConfig(model=str(piper)),
+    )
+    source, began = options.data / "teleop/so101_to_piper", time.perf_counter()
+    config = {"source": str(source), "units": "deg", "hand": "near", "base": BASE, "failing": "kept"}
+    work = prepare_retargeting(RetargetConfig(**config, env=env, out=str(out)))
+    assert work() == 0
+    seconds = time.perf_counter() - began
+    leader, follower = arm("so101", options), build_arm(env.learner, "hardware").embodiment
+    written = in_rad(read_source(out, follower.joint_names, "action", None), "deg", follower.joint_range)
+    qpos = np.concatenate(recordings(leader, "deg", options))
+    ways = {
+        "mimic": (BASE, np.concatenate([motion.qpos for motion in written.motions.values()])),
+        "recorded": (None, np.concatenate(recordings(follower, "percent", options))),
+    }
+    for method, (base, own) in ways.items():
+        row = {"method": method, "episodes": len(written.motions), "frames": len(own)}
+        row |= hand_errors(leader, follower, base, qpos, own)
+        steps = [np.abs(np.diff(motion.qpos, axis=0)).max(axis=0) for motion in written.motions.values()]
+        if method == "mimic":
+            row |= {"speed": (np.max(steps, axis=0) * 15 / SPEED["piper"]).max(), "seconds": seconds}
+        yield as_numbers(row)
+
+
 def other_methods(options: argparse.Namespace, expert: Model, row: Row) -> Iterator[tuple[str, np.ndarray]]:
     """Joint angles of the Panda copied, and those of seeded inverse kinematics; the same base."""
     path = Path(options.demonstrations) / row["task"] / "demo.hdf5"
@@ -206,7 +249,7 @@ def in_physics(options: argparse.Namespace, expert: Model, rows: list[Row]) -> l
 def main(arguments: list[str] | None = None) -> None:
     parser = make_parser(
         "transfer", __doc__, demonstrations="../shared/data/robosuite_demos", work="transfer", arms=ARMS, tasks=TASKS,
-        physics="",
+        physics="", data="",
     )  # fmt: skip
     parser.add_argument("folder")
     options = parser.parse_args(arguments)
@@ -220,11 +263,14 @@ def main(arguments: list[str] | None = None) -> None:
             print_table(content["pairs"][-1:], PAIRS)
         if "lift" in options.tasks and len(learner.range) == _WITHOUT_REDUNDANCY:
             content["round_trip"].append(round_trip(options, expert, name))
+    if options.data:
+        content["teleoperation"] = list(teleoperation(options))
     if options.physics:
         content["physics"] = in_physics(options, expert, content["pairs"])
     write_results(options, **content)
     print_table(content["pairs"], PAIRS, "pairs")
     print_table(content["round_trip"], "learner mm:.4f deg:.4f expert_rad:.4f learner_rad:.4f", "round trip of lift")
+    print_table(content.get("teleoperation", []), TELEOPERATION, "teleoperation")
     print_table(content["physics"], PHYSICS, "physics")
 
 

@@ -374,6 +374,7 @@ class RetargetConfig:
       out: folder of the data set, or file of the learner's motions; must not exist.
       costs: see `Costs`; of the optimiser.
       seed: seed of the random initial poses of the optimiser.
+      compilation_cache: see `TrainConfig`.
     """
 
     source: str = ""
@@ -391,6 +392,7 @@ class RetargetConfig:
     out: str = ""
     costs: Costs = dataclasses.field(default_factory=Costs)
     seed: int = seed_number()
+    compilation_cache: str = "~/.cache/mimic/jax"
 
     def __post_init__(self) -> None:
         check_ranges(self)

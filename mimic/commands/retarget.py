@@ -15,6 +15,7 @@ from mimic.arms.arm import finite_velocity_limit
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints, pose_limits
+from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import new_file
 from mimic.commands.config import RetargetConfig
 from mimic.commands.retarget_data import prepare_data_set
@@ -155,6 +156,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], int | None]:
     Raises:
       ValueError: a file name is missing, `out` exists, or a file belongs to other arms.
     """
+    use_compilation_cache(config.compilation_cache)
     if config.source:
         return prepare_data_set(config)
     if not config.demonstrations:

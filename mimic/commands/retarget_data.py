@@ -15,12 +15,14 @@ from rich.table import Table
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.gripper import GripperRange, gripper_range
 from mimic.base.config import new_folder
 from mimic.base.files import write_atomically
 from mimic.commands.certificate_plot import plot_certificates
 from mimic.commands.config import RetargetConfig
 from mimic.metric.config import MetricConfig
 from mimic.motions.formats.episodes import Motion
+from mimic.motions.grippers import other_gripper
 from mimic.motions.rewriting import DataSet, read_data_set, write_data_set
 from mimic.retargeting.base_placement import find_base
 from mimic.retargeting.certificate import Certificate, certify
@@ -44,6 +46,7 @@ class _Setting(NamedTuple):
     base: list[float] | None
     dt: float
     seed: int
+    grippers: tuple[GripperRange | None, GripperRange | None]
     costs: Any
     capsules: Capsules | None
     contacts: Callable[..., Any] | None
@@ -67,7 +70,8 @@ def prepare_data_set(config: RetargetConfig) -> Callable[[], int]:
     )  # fmt: skip
     dt = float(np.median(np.concatenate([np.diff(motion.time) for motion in data.measured.values()])))
     setting = _Setting(
-        expert, learner, env.metric, config.hand, config.placement, dt, config.seed, config.costs,
+        expert, learner, env.metric, config.hand, config.placement, dt, config.seed,
+        (gripper_range(env.expert), gripper_range(env.learner)) if data.grippers else (None, None), config.costs,
         *_shapes(env.learner, env.limits),
     )  # fmt: skip
 
@@ -88,7 +92,8 @@ def prepare_data_set(config: RetargetConfig) -> Callable[[], int]:
             print("error: no episode to write; failing=kept writes those that fail too", file=sys.stderr)
             return 1
         with written_atomically(out) as folder:
-            lines = write_data_set(data, folder, learner, motions, kept, np.asarray(learner.joint_range, float))
+            ranges, yaw = np.asarray(learner.joint_range, float), used.base[3] if used.base else 0.0
+            lines = write_data_set(data, folder, learner, motions, kept, ranges, yaw)
             report = _report(data, certificates, kept, used, config)
             write_atomically(folder / _REPORT, json.dumps(finite(report), indent=2) + "\n")
             plot_certificates(certificates, dt, folder / _PICTURE, f"{expert.name} to {learner.name}, {data.path.name}")
@@ -116,12 +121,24 @@ def retarget_episode(data: DataSet, name: str, setting: _Setting) -> tuple[dict[
     for index, entry in enumerate(data.motions):
         qpos = path[index * count : (index + 1) * count][:: (-1) ** index]
         qvel = np.gradient(qpos, measured.time, axis=0)
-        found[entry] = Motion(measured.time, qpos, qvel, measured.gripper)
+        found[entry] = Motion(measured.time, qpos, qvel, mapped_gripper(data, entry, name, setting))
     certificate = certify(
         setting.expert, setting.learner, measured.qpos, found[data.entry].qpos, jump,
         base=setting.base, capsules=setting.capsules, contacts=setting.contacts, demands_hand=setting.hand == "exact",
     )  # fmt: skip
     return found, certificate
+
+
+def mapped_gripper(data: DataSet, entry: str, name: str, setting: _Setting) -> np.ndarray | None:
+    """The gripper's values of an episode, as those of the learner's gripper where its range is another."""
+    own, every = data.motions[entry][name].gripper, [motion.gripper for motion in data.motions[entry].values()]
+    if own is None or any(gripper is None for gripper in every):
+        return own
+    mapped = other_gripper(np.concatenate(every), *setting.grippers)  # type: ignore[arg-type]
+    if mapped is None:
+        return own
+    ends = np.cumsum([len(gripper) for gripper in every])  # type: ignore[arg-type]
+    return np.split(mapped, ends[:-1])[list(data.motions[entry]).index(name)]
 
 
 def _shapes(arm: ArmConfig, limits: str) -> tuple[Capsules, Callable[..., Any]] | tuple[None, None]:
@@ -209,13 +226,28 @@ def _print(
     lines.append(f"base of {setting.learner.name} in that of {setting.expert.name} [m, rad]: {base}")
     lines += [note for note in data.notes if not note.startswith(_WARNING)]
     lines += [f"commands: {', '.join(data.commands) or 'none'}"]
-    lines.append(f"gripper, as in the source: {', '.join(data.gripper)}" if data.gripper else "gripper: none")
+    lines.append(_gripper_line(data, setting))
     _print_lines(console, [*lines, *written, *filter(None, [_help_line(certificates, setting)])])
 
 
 def _print_lines(console: Console, lines: Sequence[str]) -> None:
     for line in lines:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+def _gripper_line(data: DataSet, setting: _Setting) -> str:
+    """What became of the gripper."""
+    if not data.gripper:
+        return "gripper: none"
+    name, motion = next(iter(data.measured.items()))
+    expert, learner = setting.grippers
+    if expert is None or learner is None or mapped_gripper(data, data.entry, name, setting) is motion.gripper:
+        return f"gripper, as in the source: {', '.join(data.gripper)}"
+    ends = (
+        f"{', '.join(f'{x:.3g}' for x in end)}"
+        for end in (expert.closed, expert.opened, learner.closed, learner.opened)
+    )
+    return "gripper: closed at {}, open at {} becomes closed at {}, open at {}".format(*ends)
 
 
 def _help_line(certificates: Mapping[str, Certificate], setting: _Setting) -> str:

@@ -34,7 +34,7 @@ class DataSet:
       motions: by entry and episode: of the arm as measured, and as commanded [rad].
       joints: the source's names of the arm's joints, by entry.
       faults: why an episode cannot be retargeted, by its name.
-      gripper: names of the gripper's channels.
+      grippers: the entry and the names of the gripper's channels, by entry of the joints; none without a gripper.
       unit: of the source's angles.
       timed: whether the source has times.
       notes: what was assumed.
@@ -45,7 +45,7 @@ class DataSet:
     motions: Mapping[str, Mapping[str, Motion]]
     joints: Mapping[str, tuple[str, ...]]
     faults: Mapping[str, str]
-    gripper: tuple[str, ...]
+    grippers: Mapping[str, tuple[str, tuple[str, ...]]]
     unit: str
     timed: bool
     notes: tuple[str, ...]
@@ -54,6 +54,11 @@ class DataSet:
     def measured(self) -> Mapping[str, Motion]:
         """The motions of the arm as measured, by episode."""
         return self.motions[self.entry]
+
+    @property
+    def gripper(self) -> tuple[str, ...]:
+        """Names of the gripper's channels as measured."""
+        return self.grippers.get(self.entry, ("", ()))[1]
 
     @property
     def commands(self) -> tuple[str, ...]:
@@ -99,7 +104,8 @@ def read_data_set(
         *doubts(arm, raw, {name: every[name] for name in recording.commanded}, recording.joints),
     ]
     notes = tuple(filter(None, (*recording.notes, line, *suspicious)))
-    return DataSet(path, entry, every, joint_names, faults, recording.gripper, unit, rate is None, notes)
+    grippers = {name: (found.gripper_entry, found.gripper) for name, found in recordings.items() if found.gripper}
+    return DataSet(path, entry, every, joint_names, faults, grippers, unit, rate is None, notes)
 
 
 def _whole(recording: Recording, arm: Embodiment) -> tuple[dict[str, Motion], dict[str, str]]:
@@ -134,7 +140,8 @@ def _beyond(motions: Mapping[str, Motion], names: Sequence[str], ranges: np.ndar
 def _near(command: Motion, motion: Motion) -> Motion:
     """The commanded angles without full turns to the measured ones."""
     difference = command.qpos - motion.qpos
-    return motion._replace(qpos=command.qpos - 2 * np.pi * np.round(difference / (2 * np.pi)))
+    qpos = command.qpos - 2 * np.pi * np.round(difference / (2 * np.pi))
+    return motion._replace(qpos=qpos, gripper=command.gripper)
 
 
 def write_data_set(
@@ -144,6 +151,7 @@ def write_data_set(
     motions: Mapping[str, Mapping[str, Motion]],
     kept: Sequence[str],
     joint_range: Float[np.ndarray, "joints 2"],
+    yaw: float = 0.0,
 ) -> list[str]:
     """Writes the data set into an empty folder with the learner's motions, in the format and the unit of the source.
 
@@ -154,6 +162,7 @@ def write_data_set(
       motions: the learner's by entry and episode [rad], with as many samples as the expert's.
       kept: the episodes to write.
       joint_range: of the learner [rad], for units=percent.
+      yaw: of its base in that of the expert [rad], for commanded steps of the hand.
 
     Returns:
       Lines about what is left out or has another place.
@@ -162,7 +171,11 @@ def write_data_set(
         entry: {name: from_rad(motion, data.unit, joint_range) for name, motion in found.items()}
         for entry, found in motions.items()
     }
-    replacement = Replacement(learner.name, learner.joint_names, data.joints, in_unit, list(kept))
+    grippers = {
+        entry: gripper for entry, gripper in data.grippers.items()
+        if any(motions[entry][name].gripper is not data.motions[entry][name].gripper for name in kept)
+    }  # fmt: skip
+    replacement = Replacement(learner.name, learner.joint_names, data.joints, in_unit, list(kept), grippers, yaw)
     if write := _writer(data):
         lines = write(data.path, out, replacement)
         return [line if ":" in line else f"left out, as it is not known of {learner.name}: {line}" for line in lines]

@@ -18,6 +18,7 @@ from mimic.retargeting.trajectory import imitate_trajectory
 _FRAMES, _BASES, _ROUNDS = 24, 64, 3  # frames that judge a base, bases in each round of the search, and rounds
 _SPREAD = np.array([0.5, 0.5, 0.2, np.pi])  # of the first round: chain lengths of the expert, and rad
 _NARROWER = 0.35  # factor of the spread from one round to the next
+_SEARCHES = 3  # at most
 _BEST = 4  # bases that the next round starts from, and that are checked on a whole motion at the end
 # Of the score: room in the joint ranges, embodiment distance, and the hand's position alone; an exact hand has 1.
 _ROOM, _DISTANCE, POSITION_ALONE = 0.2, 0.3, 0.3
@@ -39,7 +40,8 @@ def find_base(
     """The base [x, y, z, yaw] of the learner from which most hands are exact, with room in the joint ranges.
 
     A random search that narrows in three rounds judges bases by frames of all motions. Of the best ones the first
-    is taken from which the whole longest motion is exact, within `largest_jump`, or else the most of it.
+    is taken from which the whole longest motion is exact, within `largest_jump`. Where it is from none, the search
+    goes on with frames that were not exact among those that judge, and at last the base is taken from which most are.
 
     Args:
       expert: n joints.
@@ -60,18 +62,24 @@ def find_base(
     if not len(motions):
         raise ValueError("motions: expected at least one, got none")
     paths = [checked_poses(expert, np.asarray(motion, np.float32), "motions", axes=("time",)) for motion in motions]
-    frames = spread_poses(expert, np.concatenate(paths), _FRAMES)
+    poses, longest = np.concatenate(paths), max(paths, key=len)
     metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
-    bases = best_bases(expert, learner, frames, metric, seed=seed)
-    longest, best, options = max(paths, key=len), (-1.0, bases[0]), {"hand": "exact", "largest_jump": largest_jump}
-    for base in bases:
-        motion = imitate_trajectory(expert, learner, longest, base=base, **options, **metric.arguments)
-        assert motion.hand is not None
-        exact = float(motion.hand.exact.mean())
-        if exact > best[0]:
-            best = exact, base
-        if exact == 1:
-            break
+    frames, start, best = spread_poses(expert, poses, _FRAMES), np.zeros((1, 4)), (-1.0, np.zeros(4))
+    for search in range(_SEARCHES):
+        bases = best_bases(expert, learner, frames, metric, seed=seed + search, start=start)
+        for base in bases:
+            motion = imitate_trajectory(
+                expert, learner, longest, hand="exact", largest_jump=largest_jump, base=base, **metric.arguments
+            )
+            assert motion.hand is not None
+            exact = np.asarray(motion.hand.exact)
+            if exact.mean() > best[0]:
+                best, failing = (float(exact.mean()), base), longest[~exact]
+            if exact.all():
+                return base
+        start = best[1][None]
+        hard = spread_poses(expert, failing, _FRAMES // 3)
+        frames = np.concatenate([spread_poses(expert, poses, _FRAMES - len(hard)), hard])
     return best[1]
 
 
@@ -98,10 +106,11 @@ def best_bases(
     metric: Metric,
     *,
     seed: int = 0,
+    start: Float[np.ndarray, "bases 4"] = np.zeros((1, 4)),  # noqa: B008
 ) -> Float[np.ndarray, "bases 4"]:
-    """The best bases that are found for single poses of the expert [rad], the first of them first; see `find_base`."""
+    """The best bases near some that are found for single poses of the expert [rad], the best first; see `find_base`."""
     generator, spread = np.random.default_rng(seed), _SPREAD * np.array([*[float(expert.chain_length)] * 3, 1.0])
-    bases, scores = np.zeros((1, 4)), np.full(1, -np.inf)
+    bases, scores = start, np.full(len(start), -np.inf)
     for _ in range(_ROUNDS):
         new = bases[np.arange(_BASES) % len(bases)] + generator.uniform(-spread, spread, (_BASES, 4))
         new[0] = bases[0]

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints, motion_limits, pose_limits
-from mimic.base.compilation import compiled_once
+from mimic.base.compilation import by_value, compiled_once, in_background
 from mimic.metric.distance import Metric
 from mimic.retargeting.costs import NO_COSTS, Costs
 from mimic.retargeting.exact_chunks import CHUNK, by_chunks, hand_report, in_chunks
@@ -69,8 +69,8 @@ def exact_trajectory(
 ) -> PoseImitation:
     """The motion; see `imitate_trajectory`."""
     arms, times = (expert, learner, metric, costs, capsules), len(poses)
-    tracked = _candidates(*arms)
-    chunks = [tracked(x, base, random, jump) for x in in_chunks(poses, CHUNK + 1, 1)]
+    candidates_of = _candidates(*arms)
+    chunks = [candidates_of(x, base, random, jump) for x in in_chunks(poses, CHUNK + 1, 1)]
     candidates = Candidates(*(np.concatenate(jax.device_get(part))[:times] for part in zip(*chunks, strict=True)))
     continuous, ranges = continuous_joints(learner), np.asarray(learner.joint_range)
     report = hand_report(*arms)
@@ -78,16 +78,18 @@ def exact_trajectory(
     # Whether a redundant arm stays exact on the way to another branch is only known when it goes there.
     is_redundant = learner.num_joints > 6 * len(learner.hand_joint)
 
-    def realized(cost_of_step: float) -> tuple[np.ndarray, ...]:
-        """Angles, distances and errors of the hand on the best path, as fast as it can be followed."""
-        qpos = within_ranges(best_path(candidates, jump, continuous, cost_of_step), ranges)
+    def realized(path: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Angles, distances and errors of the hand on a path, as fast as it can be followed."""
+        qpos = within_ranges(path, ranges)
         if np.any(np.abs(np.diff(qpos, axis=0)) > jump):
             qpos = _followed(arms, poses, qpos, base, jump)
         if is_redundant:
             qpos = smoothed(arms, poses, qpos, base, jump)
         return qpos, *by_chunks(lambda x, qpos: report(x, base, qpos), poses, qpos)
 
-    paths = [realized(cost) for cost in ((_PER_STEP, _INEXACT) if is_redundant else (_INEXACT,))]
+    costs_of_step = (_PER_STEP, _INEXACT) if is_redundant else (_INEXACT,)
+    best = {path.tobytes(): path for path in (best_path(candidates, jump, continuous, x) for x in costs_of_step)}
+    paths = [realized(path) for path in best.values()]
     qpos, distance, position, rotation = max(paths, key=lambda path: (is_exact(*path[2:]).sum(), -path[1].mean()))
     lower, upper = motion_limits(learner)
     inside = (qpos >= lower - 1e-6) & (qpos <= upper + 1e-6)
@@ -96,13 +98,48 @@ def exact_trajectory(
     return PoseImitation(qpos, distance, exact, HandError(position, rotation, exact))
 
 
-@compiled_once
+_ANCHORS = np.arange(SEGMENTS + 1) * SPACING
+
+
+@by_value
 def _candidates(*arms: Any) -> Callable[..., Candidates]:
-    """The function from CHUNK + 1 poses, a placement, random poses and the maximum change to CHUNK candidates."""
+    """The function from CHUNK + 1 poses, a placement, random poses and the maximum change to CHUNK candidates.
+
+    Its two parts take about as long to compile, which they are at the same time at the first call.
+    """
+    branches, tracks = _branches(*arms), _tracks(*arms)
+    began = []
+
+    def chunk(poses: np.ndarray, base: Placement, random: RandomPoses, jump: np.ndarray) -> Candidates:
+        if not began:
+            guesses = np.zeros((arms[1].num_joints, _BRANCHES, SEGMENTS + 1), np.float32)
+            began.append(in_background(lambda: tracks(poses, base, guesses, jump)))
+        found = branches(poses[_ANCHORS], base, random)
+        began[0]()
+        return tracks(poses, base, found, jump)
+
+    return chunk
+
+
+@compiled_once
+def _branches(*arms: Any) -> Callable[..., Array]:
+    """The function from poses at the anchors, a placement and random poses to postures on different branches."""
+    solver = exact_solver(*arms)
+
+    def branches(poses: Array, base: Placement, random: RandomPoses) -> Array:
+        first = shared_joints(solver.expert, solver.learner, poses)
+        return solver.branches(solver.targets(base, poses)[0], first, random, DESCENTS._replace(kept=_BRANCHES))
+
+    return branches
+
+
+@compiled_once
+def _tracks(*arms: Any) -> Callable[..., Candidates]:
+    """The function from CHUNK + 1 poses, a placement, postures at the anchors and the maximum change to candidates."""
     solver = exact_solver(*arms)
     lower, upper = (x[:, None, None] for x in pose_limits(solver.learner, np.float32))
-    anchors, steps = np.arange(SEGMENTS + 1) * SPACING, np.arange(1, SPACING + 1)[:, None]
-    times = np.concatenate([anchors[:-1] + steps, anchors[1:] - steps], axis=1)
+    steps = np.arange(1, SPACING + 1)[:, None]
+    times = np.concatenate([_ANCHORS[:-1] + steps, _ANCHORS[1:] - steps], axis=1)
 
     def track(targets: ExactTargets, begin: Array, jump: Array) -> Array:
         """[SPACING, joints, lanes, 2 SEGMENTS] candidates from those at the anchors."""
@@ -115,10 +152,8 @@ def _candidates(*arms: Any) -> Callable[..., Candidates]:
 
         return jax.lax.scan(step, begin, jnp.asarray(times))[1]
 
-    def chunk(poses: Array, base: Placement, random: RandomPoses, jump: Array) -> Candidates:
+    def chunk(poses: Array, base: Placement, branches: Array, jump: Array) -> Candidates:
         targets, states = solver.targets(base, poses)
-        first = shared_joints(solver.expert, solver.learner, poses[anchors])
-        branches = solver.branches(at(targets, anchors), first, random, DESCENTS._replace(kept=_BRANCHES))
         begin = jnp.concatenate([branches[..., :-1], branches[..., 1:]], axis=-1)
         tracks = track(targets, begin, (_SLACK * jump).astype(poses.dtype)[:, None, None])
         forwards = jnp.concatenate([begin[None, ..., :SEGMENTS], tracks[:-1, ..., :SEGMENTS]])

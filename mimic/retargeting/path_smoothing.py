@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from mimic.arms.pose_limits import motion_limits, pose_limits
 from mimic.base.compilation import compiled_once
-from mimic.retargeting.exact_chunks import by_chunks, hand_report
+from mimic.retargeting.exact_chunks import by_chunks
 from mimic.retargeting.exact_pose import exact_solver
 from mimic.retargeting.hand_target import Placement, hand_cost_derivatives, is_exact
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call, newton
@@ -42,21 +42,23 @@ def smoothed(
     """
     if len(path) < 3:
         return path
-    back, report, (lower, upper) = _back_to_the_hand(*arms), hand_report(*arms), motion_limits(arms[1])
+    back, (lower, upper) = _back_to_the_hand(*arms), motion_limits(arms[1])
 
-    def is_good(qpos: np.ndarray) -> Bool[np.ndarray, " time"]:
-        exact = is_exact(*by_chunks(lambda x, qpos: report(x, base, qpos), poses, qpos)[1:])
-        return exact & np.all((qpos >= lower - _ROUNDING) & (qpos <= upper + _ROUNDING), axis=-1)
+    def returned(qpos: np.ndarray) -> tuple[np.ndarray, Bool[np.ndarray, " time"], np.ndarray]:
+        """Angles with an exact hand near some, whether it is and was exact within the limits, and its stiffness."""
+        near, was, now, stiffness = by_chunks(lambda x, qpos: back(x, base, qpos), poses, qpos)
+        inside = [np.all((x >= lower - _ROUNDING) & (x <= upper + _ROUNDING), axis=-1) for x in (qpos, near)]
+        return near, np.stack([was & inside[0], now & inside[1]]), stiffness
 
     def fastest(qpos: np.ndarray) -> float:
         return float(np.abs(np.diff(qpos, axis=0) / jump).max(initial=0))
 
-    best, now, movable, bound = path, path, is_good(path), max(1.0, fastest(path))
-    _, stiffness = by_chunks(lambda x, qpos: back(x, base, qpos), poses, now)
+    _, (movable, _), stiffness = returned(path)
+    best, now, bound = path, path, max(1.0, fastest(path))
     for _ in range(_ROUNDS):
         near = np.clip(least_change(now, path, stiffness, movable, jump), lower, upper)
-        new, stiffness = by_chunks(lambda x, qpos: back(x, base, qpos), poses, near)
-        movable = movable & is_good(new)
+        new, (_, good), stiffness = returned(near)
+        movable = movable & good
         now = np.where(movable[:, None], new, now)
         best = now if fastest(now) <= bound else best
     return best
@@ -91,20 +93,25 @@ def least_change(
 
 
 @compiled_once
-def _back_to_the_hand(*arms: Any) -> Callable[..., tuple[Array, Array]]:
-    """The function from CHUNK poses, a placement and angles to angles with an exact hand, and the hand's stiffness."""
+def _back_to_the_hand(*arms: Any) -> Callable[..., tuple[Array, ...]]:
+    """The function from CHUNK poses, a placement and angles to angles with an exact hand.
+
+    It also returns whether the hand was exact and is, and its stiffness.
+    """
     solver = exact_solver(*arms)
     limits = pose_limits(solver.learner, np.float32)
 
-    def back(poses: Array, base: Placement, qpos: Array) -> tuple[Array, Array]:
+    def back(poses: Array, base: Placement, qpos: Array) -> tuple[Array, ...]:
         targets, _ = solver.targets(base, poses)
 
         def derivatives(qpos: Scalars, store: Store) -> Derivatives:
             return hand_cost_derivatives(solver.learner, solver.pairs[:, 1], targets.hands, qpos, 1.0, store)
 
-        lanes = newton(derivatives, qpos.astype(poses.dtype).T, limits, _STEPS, _DAMPING).qpos
+        begin = qpos.astype(poses.dtype).T
+        lanes = newton(derivatives, begin, limits, _STEPS, _DAMPING).qpos
+        was, now = (is_exact(*(x[0] for x in solver.errors(targets, qpos[:, None]))) for qpos in (begin, lanes))
         lower, joints = derivatives([*lanes], call).hessian, range(len(lanes))
         rows = [[lower[max(i, j)][min(i, j)] + jnp.zeros_like(lanes[0]) for j in joints] for i in joints]
-        return lanes.T, jnp.moveaxis(jnp.stack([jnp.stack(row) for row in rows]), -1, 0)
+        return lanes.T, was, now, jnp.moveaxis(jnp.stack([jnp.stack(row) for row in rows]), -1, 0)
 
     return back

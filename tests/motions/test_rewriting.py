@@ -206,6 +206,32 @@ def test_a_robomimic_file(tmp_path):
 # --- tables and npz ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("controller", "turns"), [
+    ({"type": "OSC_POSE", "input_type": "delta", "input_ref_frame": "base"}, True),
+    ({"type": "OSC_POSE", "control_delta": True}, False),  # in the axes of the world
+    ({"type": "JOINT_POSITION", "input_type": "delta", "input_ref_frame": "base"}, False),
+])  # fmt: skip
+def test_commanded_steps_of_the_hand_are_in_the_axes_of_the_learners_base(tmp_path, controller, turns):
+    h5py = pytest.importorskip("h5py")
+    (tmp_path / "in").mkdir()
+    with h5py.File(source := tmp_path / "in/demo.hdf5", "w") as file:
+        env = {"env_kwargs": {"control_freq": RATE, "controller_configs": {"body_parts": {"right": controller}}}}
+        file.create_group("data").attrs["env_args"] = json.dumps(env)
+        time, qpos = expert_motion(40)
+        file["data/demo_0/obs/robot0_joint_pos"] = qpos
+        steps = np.random.default_rng(0).normal(size=(40, 7))
+        file["data/demo_0/actions"] = steps
+    data = read_data_set(source, EXPERT)
+    motion = Motion(time, np.c_[qpos, qpos[:, 0]], np.c_[qpos, qpos[:, 0]])
+    write_data_set(data, tmp_path, LEARNER, {data.entry: {"demo_0": motion}}, ["demo_0"], RANGES, yaw=0.5)
+    with h5py.File(tmp_path / "demo.hdf5") as file:
+        written = file["data/demo_0/actions"][()]
+    turn = np.array([[np.cos(0.5), -np.sin(0.5), 0], [np.sin(0.5), np.cos(0.5), 0], [0, 0, 1]]) if turns else np.eye(3)
+    np.testing.assert_allclose(written[:, :3] @ turn.T, steps[:, :3], atol=1e-12)
+    np.testing.assert_allclose(written[:, 3:6] @ turn.T, steps[:, 3:6], atol=1e-12)
+    np.testing.assert_array_equal(written[:, 6], steps[:, 6])
+
+
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
 def test_a_table(tmp_path, separator):
     header = ["note", "time", *(f"{name} [deg]" for name in OLD), "jaw", "demonstration"]

@@ -28,6 +28,7 @@ class Quantity(NamedTuple):
 
 
 ANGLE, VELOCITY, TORQUE = Quantity("pos", "rad"), Quantity("vel", "rad/s"), Quantity("torque", "N m")
+GRIPPER = Quantity("gripper", "")
 
 
 class Motion(NamedTuple):
@@ -66,6 +67,7 @@ class Recording(NamedTuple):
       entry: what has the angles: the topic, feature, data set or array.
       joints: the source's names of the joints, base to tip.
       commanded: other entries that have the same joints, as they were commanded.
+      gripper_entry: what has the gripper's channels.
     """
 
     motions: dict[str, Motion]
@@ -76,6 +78,7 @@ class Recording(NamedTuple):
     entry: str = ""
     joints: tuple[str, ...] = ()
     commanded: tuple[str, ...] = ()
+    gripper_entry: str = ""
 
 
 @dataclasses.dataclass(frozen=True)

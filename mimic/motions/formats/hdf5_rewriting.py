@@ -1,6 +1,6 @@
 """Writes HDF5 files of demonstrations again for another arm; all other data sets and attributes stay as they are."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +9,14 @@ import numpy as np
 from mimic.base.files import copy_file
 from mimic.motions.formats.episodes import Motion
 from mimic.motions.formats.hdf5 import (
+    ACTIONS,
     MODEL,
     OTHER_COPIES,
     STATES,
     episode_label,
     episodes,
     files_of,
+    step_controller,
     velocities_entry,
 )
 from mimic.motions.formats.replacing import Replacement, replaced_columns, replaced_values
@@ -57,6 +59,8 @@ def rewrite_hdf5(source: Path, out: Path, replacement: Replacement) -> list[str]
 
 def _replace(episode: Any, label: str, replacement: Replacement) -> Iterator[str]:
     """Replaces the data sets of an episode."""
+    if ACTIONS in episode.sets and (controller := step_controller(episode)):
+        yield _turn_steps(episode.group, controller, replacement.yaw)
     for entry, old_joints in replacement.old_joints.items():
         motion = replacement.motions[entry][label]
         if entry == STATES and MODEL in episode.group.attrs:
@@ -68,6 +72,9 @@ def _replace(episode: Any, label: str, replacement: Replacement) -> Iterator[str
                 _set(episode.group, _GRIPPER, motion.gripper)
             continue
         _replace_set(episode.group, entry, old_joints, replacement, motion)
+        of_gripper, gripper = replacement.grippers.get(entry, ("", ()))
+        if of_gripper and of_gripper != entry:
+            _set(episode.group, of_gripper, np.reshape(motion.gripper, episode.group[of_gripper].shape))  # type: ignore[arg-type]
         if other := velocities_entry(episode, entry):
             _replace_set(episode.group, other, old_joints, replacement, motion._replace(qpos=motion.qvel))
         for end, function in _FUNCTIONS.items():
@@ -81,12 +88,26 @@ def _replace(episode: Any, label: str, replacement: Replacement) -> Iterator[str
             yield f"{copy}: the last one is that of {entry}, since no later one is known"
 
 
+def _turn_steps(group: Any, controller: Mapping[str, Any], yaw: float) -> str:
+    """Turns the commanded steps of the hand into the axes of the learner's base, where a controller has those."""
+    if controller.get("input_ref_frame", "world") != "base" or not yaw:
+        return f"{ACTIONS}: steps of the hand, which the learner's has as well"
+    steps, (cosine, sine) = np.array(group[ACTIONS]), (np.cos(yaw), np.sin(yaw))
+    width = 6 if "POSE" in controller["type"] else 3
+    for first in range(0, min(width, steps.shape[1]), 3):  # of the position, and of the rotation
+        x, y = steps[:, first].copy(), steps[:, first + 1].copy()
+        steps[:, first], steps[:, first + 1] = cosine * x + sine * y, cosine * y - sine * x
+    _set(group, ACTIONS, steps)
+    return f"{ACTIONS}: steps of the hand, in the axes of the learner's base"
+
+
 def _replace_set(group: Any, entry: str, old: tuple[str, ...], replacement: Replacement, motion: Motion) -> None:
     """Replaces the columns of the joints in a data set, which are numbered from 1."""
     values = group[entry][()]
     table = values.reshape(len(values), -1)
     names = [str(number) for number in range(1, table.shape[1] + 1)]
-    columns, _ = replaced_columns(names, old, replacement.joints)
+    of_gripper, gripper = replacement.grippers.get(entry, ("", ()))
+    columns, _ = replaced_columns(names, old, replacement.joints, gripper if of_gripper == entry else ())
     _set(group, entry, replaced_values(table, columns, motion))
 
 

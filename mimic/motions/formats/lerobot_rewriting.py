@@ -27,7 +27,9 @@ class _Plan:
         self.dropped: list[str] = []
         for entry, joints in replacement.old_joints.items():
             names = feature_names(self.features[entry])
-            self.columns[entry], dropped = replaced_columns(names, joints, replacement.joints)
+            of_gripper, gripper = replacement.grippers.get(entry, ("", ()))
+            gripper = gripper if of_gripper == entry else ()
+            self.columns[entry], dropped = replaced_columns(names, joints, replacement.joints, gripper)
             self.dropped += [f"{name} of {entry}" for name in dropped]
             self.features[entry] = _description(self.features[entry], self.columns[entry])
         kept = sorted(int(name.removeprefix(_EPISODE)) for name in replacement.kept)

@@ -72,7 +72,7 @@ class Selection(NamedTuple):
     def facts(self) -> dict[str, Any]:
         """What a `Recording` says about its columns."""
         return {"gripper": tuple(self.gripper), "entry": self.entry, "joints": tuple(self.joints),
-                "commanded": tuple(self.commanded)}  # fmt: skip
+                "commanded": tuple(self.commanded), "gripper_entry": self.gripper_entry}  # fmt: skip
 
 
 def parse_column(text: str) -> Column:

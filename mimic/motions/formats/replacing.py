@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mimic.motions.formats.episodes import ANGLE, VELOCITY, Motion, Quantity
+from mimic.motions.formats.episodes import ANGLE, GRIPPER, VELOCITY, Motion, Quantity
 from mimic.motions.formats.names import numbers_joints, parse_column
 
 
@@ -20,6 +20,8 @@ class Replacement(NamedTuple):
       motions: the learner's motions by entry and episode, with the samples and the unit of the source, and with
         velocities.
       kept: names of the episodes that are written.
+      grippers: the entry and the names of the gripper's channels that motions have otherwise, by entry of the joints.
+      yaw: of the learner's base in that of the expert [rad].
     """
 
     robot: str
@@ -27,6 +29,8 @@ class Replacement(NamedTuple):
     old_joints: Mapping[str, tuple[str, ...]]
     motions: Mapping[str, Mapping[str, Motion]]
     kept: Sequence[str]
+    grippers: Mapping[str, tuple[str, tuple[str, ...]]] = {}
+    yaw: float = 0.0
 
 
 class Column(NamedTuple):
@@ -36,7 +40,7 @@ class Column(NamedTuple):
       name: of the column.
       index: the column that is carried over, or that of the expert whose place it takes.
       quantity: of a joint of the learner; None for a column that is carried over.
-      joint: number of that joint.
+      joint: number of that joint, or of the gripper's channel.
     """
 
     name: str
@@ -46,12 +50,13 @@ class Column(NamedTuple):
 
 
 def replaced_columns(
-    names: Sequence[str], old_joints: Sequence[str], joints: Sequence[str]
+    names: Sequence[str], old_joints: Sequence[str], joints: Sequence[str], gripper: Sequence[str] = ()
 ) -> tuple[list[Column], list[str]]:
     """The columns with those of one arm's joints replaced by another's, and the names of columns that are left out.
 
     Angles and velocities stand where the first ones of the expert stood, and are called as these were: by the learner's
     names of joints, or by numbers where the source numbers them. Torques of the expert are none of the learner.
+    Channels of `gripper` keep their names.
     """
     numbered = numbers_joints(old_joints)
     columns: list[Column] = []
@@ -60,7 +65,9 @@ def replaced_columns(
     for index, name in enumerate(names):
         parsed = parse_column(name)
         joint = next((old for old in old_joints if parsed.joint.endswith(old)), "")  # after a prefix of the reader's
-        if not joint:
+        if not joint and parsed.joint in gripper and parsed.quantity == ANGLE:
+            columns.append(Column(name, index, GRIPPER, gripper.index(parsed.joint)))
+        elif not joint:
             columns.append(Column(name, index))
         elif parsed.quantity not in (ANGLE, VELOCITY):
             dropped.append(name)
@@ -82,7 +89,7 @@ def replaced_values(values: np.ndarray, columns: Sequence[Column], motion: Motio
       columns: see `replaced_columns`.
       motion: of the learner, at the same samples.
     """
-    of = {ANGLE: motion.qpos, VELOCITY: motion.qvel}
+    of = {ANGLE: motion.qpos, VELOCITY: motion.qvel, GRIPPER: motion.gripper}
     parts = [
         values[:, column.index] if column.quantity is None else of[column.quantity][:, column.joint]  # type: ignore[index]
         for column in columns

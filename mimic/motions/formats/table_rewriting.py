@@ -10,7 +10,7 @@ import numpy as np
 from mimic.base.npz import read_arrays
 from mimic.motions.formats.archives import addresses
 from mimic.motions.formats.cells import read_cells
-from mimic.motions.formats.episodes import ANGLE, VELOCITY, Motion
+from mimic.motions.formats.episodes import ANGLE, GRIPPER, VELOCITY, Motion
 from mimic.motions.formats.replacing import Column, Replacement, replaced_columns
 from mimic.motions.formats.tables import rows_of_table, tables_by_quantity
 
@@ -33,7 +33,8 @@ def rewrite_table(source: Path, out: Path, replacement: Replacement, timed: bool
     ((entry, old_joints),) = replacement.old_joints.items()
     motions = replacement.motions[entry]
     text, names, episodes = rows_of_table(source, len(old_joints), timed)
-    columns, dropped = replaced_columns(names, old_joints, replacement.joints)
+    _, gripper = replacement.grippers.get(entry, ("", ()))
+    columns, dropped = replaced_columns(names, old_joints, replacement.joints, gripper)
     separator = text.separator or _BLANK
     lines = [*text.comments, *([separator.join(column.name for column in columns)] if text.header else [])]
     count = dict.fromkeys(motions, 0)
@@ -50,7 +51,7 @@ def _cell(cells: Sequence[str], column: Column, motion: Motion, at: int) -> str:
     """The text of a cell: the old one, or the number of the learner's joint at a sample."""
     if column.quantity is None:
         return cells[column.index]
-    values = motion.qpos if column.quantity == ANGLE else motion.qvel
+    values = {ANGLE: motion.qpos, VELOCITY: motion.qvel, GRIPPER: motion.gripper}[column.quantity]
     return f"{values[at, column.joint]:{_DIGITS}}"  # type: ignore[index]  # see `Replacement`
 
 
