@@ -1,4 +1,4 @@
-"""`python -m mimic.export run=DIR out=FILE`: exports a policy or pose mapper to ONNX, or to StableHLO for JAX."""
+"""`python -m mimic.export run=DIR out=FILE`: exports a policy or pose mapper to ONNX."""
 
 from mimic.base import compat
 from mimic.commands import cli

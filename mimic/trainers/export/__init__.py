@@ -1,1 +1,1 @@
-"""Trained networks as functions of other tools: ONNX and StableHLO."""
+"""Trained networks as functions of other tools: ONNX."""

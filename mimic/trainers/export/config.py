@@ -7,7 +7,7 @@ from mimic.base.config import check_choice
 from mimic.base.ranges import check_ranges, checkpoint_number
 
 CONTROLLER = "controller"  # a format of a folder, see mimic/trainers/export/export_controller.py
-EXPORT_FORMATS = ("onnx", "jax", CONTROLLER)
+EXPORT_FORMATS = ("onnx", CONTROLLER)
 
 
 def check_locked(locked: list[Any], learner: str) -> None:
@@ -23,8 +23,8 @@ class ExportConfig:
     Attributes:
       run: run directory.
       out: exported file, or folder of a controller; must not exist.
-      format: "onnx", "jax", or "controller": a policy with an inner loop and what a robot needs beside it.
-      learner: of a mapper to any arm, an arm whose description is written to `out` instead.
+      format: "onnx", or "controller": a policy with an inner loop and what a robot needs beside it.
+      learner: of a mapper to any arm, the arm that it maps to. Default "": that of its environment.
       locked: numbers or names of the joints of this arm that are locked.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
     """

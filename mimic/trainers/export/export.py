@@ -7,38 +7,27 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
-import jax
-import jax.numpy as jnp
 from rich.console import Console
 
 from mimic.arms.arm import ArmConfig
-from mimic.arms.description import SUFFIX, save_description
 from mimic.base.config import check_choice, new_file, new_folder
 from mimic.base.distribution import install_command
-from mimic.base.files import write_atomically
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.export.config import CONTROLLER, EXPORT_FORMATS, ExportConfig
 from mimic.trainers.export.export_controller import prepare_controller
 from mimic.trainers.export.functions import ExportedFunction, make_function
 from mimic.trainers.export.onnx_model import to_onnx
-from mimic.trainers.pose_mapper.mapper_arm import describe_arm
 from mimic.trainers.run_config import load_config
 
-# The packages that write each format.
-_PACKAGES = {
-    "onnx": ("jax2onnx", "onnxruntime"),
-    "jax": ("flatbuffers",),
-    CONTROLLER: ("jax2onnx", "onnxruntime"),
-}
-_JAX_PLATFORMS = ("cpu", "cuda")
+_PACKAGES = ("jax2onnx", "onnxruntime")
 
 
 def export_run(
     run: str | os.PathLike[str],
     out: str | os.PathLike[str],
     *,
-    format: Literal["onnx", "jax", "controller"] = "onnx",
+    format: Literal["onnx", "controller"] = "onnx",
     learner: str = "",
     locked: Sequence[int | str] = (),
     checkpoint: int | None = None,
@@ -47,20 +36,14 @@ def export_run(
 
     A policy maps `observation` [batch, observations] to `action` [batch, joints] in [-1, 1], without exploration, and
     to `torque` [N m]. A pose mapper maps `expert_qpos` [batch, joints] to `learner_qpos` [batch, learner_joints], both
-    in rad. The file includes the normalisation of inputs and the scaling of outputs.
-
-    The function of a mapper to any arm has an input `learner`: the description of an arm, which this function writes
-    too. With the metadata's `learner_layout` it can also be made without mimic, see `ArmArrays` in
-    mimic/arms/arrays.py. Its angles are [batch, 8], with those of locked joints, and 0 where the arm has no joint; in
-    the format "onnx" the batch size is 1.
+    in rad; that of a mapper to any arm takes one pose a call. The file includes the normalisation of inputs and the
+    scaling of outputs.
 
     Args:
       run: run directory.
       out: exported file; must not exist.
-      format: "onnx", or "jax" for `jax.export.deserialize`, with the metadata in a second file named `out` + ".json";
-        or "controller", a folder for `mimic.deploy`, see `export_controller`.
-      learner: of a mapper to any arm, an arm (see `ArmConfig.model`) whose description is written to `out`, a .json
-        file, instead of the network.
+      format: "onnx", or "controller", a folder for `mimic.deploy`, see `export_controller`.
+      learner: of a mapper to any arm, the arm that it maps to (see `ArmConfig.model`); the environment's where empty.
       locked: numbers or names of the joints of this arm that are locked.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
 
@@ -95,23 +78,23 @@ def prepare_export(config: ExportConfig) -> Callable[[], None]:
 
 
 def _writer(config: ExportConfig) -> tuple[Callable[[], None], str]:
-    """Writes the controller of a run, its network, or the description of an arm; and the inputs and outputs as text."""
+    """Writes the controller or the network of a run; and the inputs and outputs as text."""
+    check_choice("format", config.format, EXPORT_FORMATS)
     if config.format == CONTROLLER:
-        _check_package(config.format)
+        _check_packages(config.format)
         out = new_folder("out", config.out)
         write = prepare_controller(_run_dir(config), config.checkpoint)
         _check_no_learner(config)
         return lambda: write(out), ""
-    if config.learner and config.run:
-        trained = _exportable(config)
-        if trained.env.kind == "sampled_arms":
-            check_checkpoint(_run_dir(config), config.checkpoint)
-            return _description_writer(trained, config), ""
-    out, exported = _file(config), exported_function(config)
+    out = new_file("out", config.out)
+    if not os.access(out.parent, os.W_OK):
+        raise ValueError(f"out: {str(out)!r}: the folder cannot be written to")
+    _check_packages(config.format)
+    exported = exported_function(config)
     inputs = ", ".join(f"{name} [batch, {size}]" for name, size in exported.inputs.items())
     title = f"{exported.kind.replace('_', ' ')} of {exported.metadata['env']}"
     summary = f"{title}: {inputs} -> {', '.join(exported.metadata['outputs'])}"
-    return lambda: _write(exported, out, config.format), summary
+    return lambda: _write(exported, out), summary
 
 
 def _run_dir(config: ExportConfig) -> Path:
@@ -120,30 +103,13 @@ def _run_dir(config: ExportConfig) -> Path:
     return Path(config.run).expanduser()
 
 
-def _check_package(format: str) -> None:
+def _check_packages(format: str) -> None:
     """Raises a `ValueError` where a package that writes a format is not installed."""
-    for package in _PACKAGES[format]:
+    for package in _PACKAGES:
         try:
             importlib.import_module(package)
         except ImportError as error:
             raise ValueError(f"format={format} needs the package {package}: {install_command('export')}") from error
-
-
-def _file(config: ExportConfig) -> Path:
-    """The new file of the export."""
-    check_choice("format", config.format, EXPORT_FORMATS)
-    out = new_file("out", config.out)
-    if config.format == "jax":
-        new_file("out", str(_metadata_file(out)))
-    if not os.access(out.parent, os.W_OK):
-        raise ValueError(f"out: {str(out)!r}: the folder cannot be written to")
-    _check_package(config.format)
-    return out
-
-
-def _metadata_file(out: Path) -> Path:
-    """The file of the metadata, for the format "jax"."""
-    return out.with_name(out.name + ".json")
 
 
 def _exportable(config: ExportConfig) -> TrainConfig:
@@ -163,24 +129,10 @@ def exported_function(config: ExportConfig) -> ExportedFunction:
     """The function of a run's network."""
     run_dir, trained = _run_dir(config), _exportable(config)
     steps = check_checkpoint(run_dir, config.checkpoint)
-    _check_no_learner(config)
-    return make_function(trained, run_dir, steps)
-
-
-def _description_writer(trained: TrainConfig, config: ExportConfig) -> Callable[[], None]:
-    """Writes the description of an arm for the exported function of a mapper to any arm.
-
-    Raises:
-      ValueError: another suffix than that of descriptions, or no such arm.
-    """
-    file, learner, locked = new_file("out", config.out), config.learner, config.locked
-    if file.suffix != SUFFIX:
-        raise ValueError(
-            f"out: expected a file {SUFFIX} for the description of learner={learner}, got {config.out!r}; "
-            "export the network, which takes any arm, without learner="
-        )
-    described = describe_arm(trained.env, ArmConfig(model=learner, locked=list(locked)) if locked else learner)
-    return lambda: save_description(file, described.data, described.embodiment.name, described.slots)
+    if trained.env.kind != "sampled_arms":
+        _check_no_learner(config)
+    name, locked = config.learner, config.locked
+    return make_function(trained, run_dir, steps, ArmConfig(model=name, locked=locked) if locked else name or None)
 
 
 def _check_no_learner(config: ExportConfig) -> None:
@@ -189,31 +141,11 @@ def _check_no_learner(config: ExportConfig) -> None:
         raise ValueError(f"learner: expected none for a run of one learner, got {config.learner!r}")
 
 
-def _write(exported: ExportedFunction, out: Path, format: str) -> None:
-    content = {"onnx": _onnx_bytes, "jax": _jax_bytes}[format](exported)
+def _write(exported: ExportedFunction, out: Path) -> None:
+    texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in exported.metadata.items()}
+    content = to_onnx(
+        exported.function, name=exported.kind, inputs=exported.inputs, metadata=texts, has_batch=exported.has_batch
+    )
     partial = out.with_name(out.name + ".partial")
     partial.write_bytes(content)
-    if format == "jax":
-        write_atomically(_metadata_file(out), json.dumps(exported.metadata, indent=2) + "\n")
     os.replace(partial, out)
-
-
-def _onnx_bytes(exported: ExportedFunction) -> bytes:
-    texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in exported.metadata.items()}
-    return to_onnx(
-        exported.function,
-        name=exported.kind,
-        inputs=exported.inputs,
-        metadata=texts,
-        samples=exported.samples,
-        has_batch=exported.has_batch,
-    )
-
-
-def _jax_bytes(exported: ExportedFunction) -> bytes:
-    from jax import export  # jax.export must be imported explicitly
-
-    (batch,) = export.symbolic_shape("batch")
-    shapes = [jax.ShapeDtypeStruct((batch, size), jnp.float32) for size in exported.inputs.values()]
-    serializable = export.export(jax.jit(jax.vmap(exported.function)), platforms=_JAX_PLATFORMS)(*shapes)
-    return bytes(serializable.serialize())

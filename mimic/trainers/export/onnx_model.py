@@ -21,6 +21,7 @@ from mimic.base import compat
 
 OPSET, IR_VERSION = 18, 8  # of 2022: all runtimes since then read them
 TOLERANCE = 1e-5  # of float32, with sums in another order
+_LONG_TOLERANCE = 1e-4  # of functions without a batch: Newton steps magnify rounding errors
 # Where two candidates of a mapper are equally good, or an angle is at the seam of the circle, rounding decides.
 _EQUAL_SAMPLES, _SAMPLES = 0.75, 32
 
@@ -31,7 +32,6 @@ def to_onnx(
     name: str,
     inputs: Mapping[str, int],
     metadata: Mapping[str, str] | None = None,
-    samples: Mapping[str, np.ndarray] | None = None,
     has_batch: bool = True,
 ) -> bytes:
     """Converts a function of float32 vectors to an ONNX model of inputs [batch, length].
@@ -41,8 +41,6 @@ def to_onnx(
       name: name of the graph.
       inputs: length of the vector of each input.
       metadata: `metadata_props` of the model.
-      samples: [samples, length] values of each input, for which the model is compared with the function. Default None:
-        normal numbers.
       has_batch: for any batch size; otherwise it is 1, which takes a third of the operations where there are many.
 
     Raises:
@@ -77,10 +75,9 @@ def to_onnx(
     model.ir_version, model.producer_name = IR_VERSION, "mimic"
     helper.set_model_props(model, dict(metadata or {}))
     content = model.SerializeToString()
-    if samples is None:
-        rng = np.random.default_rng(0)
-        samples = {key: rng.normal(size=(_SAMPLES, size)) for key, size in inputs.items()}
-    _check(content, function, {key: np.asarray(samples[key], np.float32) for key in inputs}, has_batch)
+    rng = np.random.default_rng(0)
+    samples = {key: rng.normal(size=(_SAMPLES, size)).astype(np.float32) for key, size in inputs.items()}
+    _check(content, function, samples, has_batch)
     return content
 
 
@@ -96,6 +93,7 @@ def _check(
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     count = len(next(iter(inputs.values())))
     parts = [slice(None)] if has_batch else [slice(i, i + 1) for i in range(count)]
+    tolerance = TOLERANCE if has_batch else _LONG_TOLERANCE
     rows = [session.run(None, {name: values[part] for name, values in inputs.items()}) for part in parts]
     expected = jax.jit(jax.vmap(function))(*inputs.values())
     for output, *actual in zip(session.get_outputs(), *rows, strict=True):
@@ -103,9 +101,9 @@ def _check(
         if values.shape != reference.shape:
             raise ValueError(f"onnx: {output.name}: expected the shape {reference.shape} of JAX, got {values.shape}")
         error = np.abs(values - reference).max(axis=1) / max(1.0, float(np.abs(reference).max()))
-        if not np.mean(error <= TOLERANCE) >= _EQUAL_SAMPLES:  # not a number is an error too
+        if not np.mean(error <= tolerance) >= _EQUAL_SAMPLES:  # not a number is an error too
             raise ValueError(
-                f"onnx: {output.name}: expected the values of JAX to {TOLERANCE:g}, got a median error of "
+                f"onnx: {output.name}: expected the values of JAX to {tolerance:g}, got a median error of "
                 f"{np.median(error):g}"
             )
 

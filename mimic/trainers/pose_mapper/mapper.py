@@ -13,7 +13,6 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mimic.arms.arm import ArmConfig
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import pose_limits
@@ -154,6 +153,10 @@ class PoseMapper:
         """The poses among which the mapper chooses the nearest [rad]; of one pose of the expert."""
         return self._learner.own_joints(self.model.improved(self.params, self._target(qpos)))
 
+    def nearest(self, qpos: Float[Array, " joints"]) -> Float[Array, " learner_joints"]:
+        """What a call returns for one pose of the expert [rad], without checks."""
+        return self._learner.own_joints(self.model(self.params, self._target(qpos)))
+
     def distance(self, qpos: Float[Array, " joints"], learner_qpos: Float[Array, " learner_joints"]) -> Array:
         """Embodiment distance between a pose of the expert and a pose of the learner."""
         return self._target(qpos).distance(self._learner.in_slots(learner_qpos))
@@ -202,8 +205,8 @@ AnyArmMapper = PoseMapper  # in `mimic.__all__`: a mapper that takes any learner
 def load_mapper(
     run_dir: str | os.PathLike[str],
     checkpoint: int | None = None,
-    learner: ArmConfig | None = None,
-    expert: ArmConfig | None = None,
+    learner: NamedArm | None = None,
+    expert: NamedArm | None = None,
 ) -> PoseMapper:
     """The mapper of a run to one learner, whether the run trained for that one or for any arm.
 
