@@ -15,14 +15,13 @@ from mimic.deploy.driver import Command
 from mimic.deploy.runner import run_controller
 from mimic.deploy.safety import COLLISION, LATE, REPEATED, SafetyLayer
 from mimic.evaluation.virtual_robot import runs
-from mimic.evaluation.virtual_robot.driver import VirtualRobot
 from mimic.evaluation.virtual_robot.episodes import ABORTED, Channel, SafeController, run_episodes
 from mimic.evaluation.virtual_robot.loops import LOOPS
 from mimic.evaluation.virtual_robot.robots import FLOOR_CONTACT, TORQUE_RATE, VirtualRobots
 from mimic.evaluation.virtual_robot.runs import Task, groups, run_task, run_tasks
 from mimic.physics.world import WorldConfig
 from tests.helpers import bundles
-from tests.helpers.virtual_robots import hardware, model, virtual, world
+from tests.helpers.virtual_robots import VirtualRobot, hardware, model, virtual, world
 
 TICKS = 100  # 5 s
 LONGEST = 20  # ticks for which a random action is held
@@ -98,7 +97,7 @@ def test_lockstep_is_a_robot_alone(bundle, loop):
             qpos.append(self.robots.qpos[0].copy())
             return super().read()
 
-    driver = Watching(model(), world(), bundle, bundle.start_pose, loop)
+    driver = Watching(bundle, loop)
     assert run_controller(driver, bundle, clock=driver).is_complete
     assert np.ptp(episodes.qpos[0], axis=0).min() > 0.05
     tolerance = 1e-6 if loop == "mimic" else 3e-3  # a batch of the network rounds otherwise; Ruckig's profiles branch
@@ -109,7 +108,7 @@ def test_lockstep_is_a_robot_alone(bundle, loop):
 @pytest.mark.parametrize("loop", LOOPS)
 def test_a_robot_without_another_command_stops_where_its_path_was_checked(bundle, loop):
     """As where the program ends in the middle of a motion."""
-    driver = VirtualRobot(model(), world(), bundle, bundle.start_pose, loop)
+    driver = VirtualRobot(bundle, loop)
     layer, pose = SafetyLayer(bundle, Clearance(bundle)), bundle.start_pose[:, None]
     layer.start(pose, 0 * pose, pose)
     for tick in range(8):
