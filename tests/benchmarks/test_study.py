@@ -1,18 +1,13 @@
-"""The study of dynamic imitation: what it asks for, how its runs are started, and what it makes of them."""
+"""The study of dynamic imitation asks for what the commands take."""
 
-import csv
-import json
-import sys
 from pathlib import Path
 
 import hydra
 import pytest
 
 from benchmarks import dynamic_imitation as study
-from benchmarks.common.processes import run_parallel
 from mimic.commands import cli
 from mimic.metric.config import MetricConfig
-from tests.helpers.run_directories import write_run
 
 UNSEEN = {f"{{{kind}}}": f"demonstrations={kind}.npz" for kind in ("computed_torque", "reach")}
 
@@ -57,49 +52,3 @@ def test_the_variants_change_the_metric_as_they_are_named(compose):
         metric = compose("train", cases[f"variant-{name}"].arguments).env.metric
         assert (metric.correspondence, metric.links) == (correspondence, links)
     assert f"env.metric.translation={4 * reference.translation:g}" in cases["variant-positions_x4"].arguments
-
-
-def test_a_failed_command_is_named_and_the_rest_goes_on(tmp_path, capsys):
-    commands = {
-        tmp_path / "bad.log": [sys.executable, "-c", "raise SystemExit('no arm')"],
-        tmp_path / "good.log": [sys.executable, "-c", "import os; print(os.environ['CUDA_VISIBLE_DEVICES'])"],
-    }
-    assert run_parallel(commands, jobs=1, devices=1) == [tmp_path / "bad.log"]
-    assert "bad failed: no arm" in capsys.readouterr().out
-    assert (tmp_path / "good.log").read_text() == "0\n"
-
-
-def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
-    started = []
-    monkeypatch.setattr(study, "run_parallel", lambda commands, **_: started.append(list(commands)) or [])
-    monkeypatch.setattr(study, "unseen_demonstrations", lambda _: UNSEEN)
-    chosen = [case for case in study.cases("quick") if case.name in ("panda4dof", "panda3dof")]
-    write_run(tmp_path / "panda4dof" / "0", [0.5])
-    write_run(tmp_path / "panda4dof--pd" / "0", [0.5])
-    study.run(chosen, tmp_path, jobs=1)
-    (trained,), evaluated = started
-    assert trained.stem == "panda3dof"
-    names = {log.stem for log in evaluated}
-    assert "panda4dof--hold-0" in names and "panda4dof--pd-0" not in names and "panda3dof--hold-0" not in names
-
-
-def test_results_are_grouped_by_case_and_seed(tmp_path):
-    entries = {key: {"train": 0.5, "held_out": 0.6} for key in study.STUDY["entries"]}
-
-    def add(name, gaps, seed, **more):
-        run = write_run(tmp_path / name / str(seed), gaps, seed=seed)
-        report = json.loads((run / "report.json").read_text())
-        (run / "report.json").write_text(json.dumps({**entries, **report, **more}))
-        return run
-
-    for seed, gaps in ((1, [0.9, 0.2, 0.3]), (0, [0.8, 0.4])):
-        add("panda7dof", gaps, seed)
-        with (tmp_path / "panda7dof" / str(seed) / "quality.csv").open("w", newline="") as file:
-            csv.writer(file).writerows([["split", "time", "mean"], ["train", 0.1, 9], ["held_out", 0.1, 0.5]])
-    pd = add("panda7dof--pd", [0.5], 0, trainer="pd", evaluated={"demonstrations": ""}, frequency_rad_s=4.0)
-    (pd / "metrics.csv").unlink()
-    results = study.collect(tmp_path)
-    assert [entry["seed"] for entry in results["panda7dof"]] == [0, 1]
-    assert (results["panda7dof"][1]["best_gap"], results["panda7dof"][1]["final_gap"]) == (0.2, 0.3)
-    assert results["panda7dof"][0]["curves"] == {"time": [0.1], "mean": [0.5]}
-    assert results["panda7dof--pd"][0]["frequency_rad_s"] == 4.0 and "best_gap" not in results["panda7dof--pd"][0]
