@@ -49,6 +49,7 @@ def test_arguments_that_every_command_rejects(arguments, message):
     assert str(error.value).splitlines() == [str(error.value)]
 
 
+@pytest.mark.slow_for(*(" ".join(arguments)[:50] for arguments, _ in LATE[3:-2]))
 @pytest.mark.parametrize(
     ("arguments", "message"), [EARLY[0], *LATE], ids=[" ".join(arguments)[:50] for arguments, _ in [EARLY[0], *LATE]]
 )

@@ -50,15 +50,9 @@ def test_a_view_rejects_many(run_dir, reason):
     assert "expected an environment of one learner, got" in reason("view", f"run={run_dir}")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "learner: expected one arm for a run of many, env=panda_family, as in learner=panda locked=[2,4]"),
-        (["learner=panda", "demonstration=9"], "demonstration: "),
-    ],
-)
-def test_a_video_is_of_one_of_many_arms(run_dir, reason, arguments, message):
-    assert message in reason("render", f"run={run_dir}", *arguments)
+def test_a_video_is_of_one_of_many_arms(run_dir, reason):
+    message = "learner: expected one arm for a run of many, env=panda_family, as in learner=panda locked=[2,4]"
+    assert message in reason("render", f"run={run_dir}")
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ def shown(monkeypatch, capsys, name, *arguments):
     return keys
 
 
+@pytest.mark.slow_for(*(name for name in commands() if name not in ("train", "view", "export")))
 @pytest.mark.parametrize("name", commands())
 def test_every_key_has_an_explanation(name, monkeypatch, capsys):
     for line in shown(monkeypatch, capsys, name).splitlines():

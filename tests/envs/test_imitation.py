@@ -24,7 +24,7 @@ OF_MANY_ARMS = ("any_arm", "panda_family")
 QUICK = ("planar4dof", "panda3dof")  # the others have all their shapes checked
 
 
-@pytest.mark.slow_for("any_arm", "panda_family")
+@pytest.mark.slow_for("any_arm", "panda_family", "pair", "panda4dof", "planar7dof")
 @pytest.mark.parametrize("name", mimic.environments())
 def test_every_environment_has_its_shapes(name):
     env = mimic.make(name, demonstrations=FEW)

@@ -38,21 +38,26 @@ def rollouts(distance: Any) -> Rollouts:
     return Rollouts(still, still, still, still[..., 0] + by_row)
 
 
-def evaluator_of(env, monkeypatch, bound, *, arms=None):
+def evaluator_of(env, arms, bound):
     """With these bounds of the arms, and a distance of holding of 1."""
-    evaluator = Evaluator(env, env.held_out, arms or report_arms(env.config), unused)
+    evaluator: Any = Evaluator(env, env.held_out, arms, unused)
     controller: Any = rollouts([0.28] * 7 + [0.9])
     bounds = np.minimum(rollouts(bound).distance, controller.distance)
     motions: Any = dict.fromkeys((CONTROLLER, "nearest_poses", "hold_home"), controller.qpos)
     references = References(bounds, np.ones_like(bounds), motions, controller.distance)
-    monkeypatch.setattr(evaluator, "_references", lambda: references)
+    evaluator._references = lambda: references
     return evaluator
 
 
-@pytest.fixture
-def evaluator(env, monkeypatch):
+@pytest.fixture(scope="module")
+def arms(env):
+    return report_arms(env.config)
+
+
+@pytest.fixture(scope="module")
+def evaluator(env, arms):
     """The last arm's best motion saves a tenth of the distance of holding."""
-    return evaluator_of(env, monkeypatch, [0.2] * 7 + [0.9])
+    return evaluator_of(env, arms, [0.2] * 7 + [0.9])
 
 
 OUTCOME = rollouts([0.2, 0.28, 0.36, 0.6, 0.1, 0.2, 0.2, 0.95])
@@ -76,9 +81,8 @@ def test_the_summary_is_of_arms_with_a_gap(evaluator):
     assert summary["hold_distance"] == pytest.approx({"train": 1, "held_out": 1})
 
 
-def test_a_split_without_arms_is_left_out(env, monkeypatch):
-    arms = report_arms(env.config)
-    evaluator = evaluator_of(env, monkeypatch, [0.2] * 8, arms={SEEN: {**arms[SEEN], **arms[UNSEEN]}, UNSEEN: {}})
+def test_a_split_without_arms_is_left_out(env, arms):
+    evaluator = evaluator_of(env, {SEEN: {**arms[SEEN], **arms[UNSEEN]}, UNSEEN: {}}, [0.2] * 8)
     assert all(values.keys() == {"train"} for values in evaluator.summary(OUTCOME).values())
     assert evaluator.similarity_summary(OUTCOME, "policy")["policy"]["tangent_angle_deg"].keys() == {"train"}
 
@@ -106,8 +110,7 @@ def test_similarity_of_the_home_pose_is_that_of_holding(evaluator):
     assert list(evaluator.similarity_summary(OUTCOME, "nearest_pose")) == ["nearest_pose", "nearest_poses", "hold_home"]
 
 
-def test_arms_have_different_names(env):
-    arms = report_arms(env.config)
+def test_arms_have_different_names(env, arms):
     for twice in ({SEEN: arms[SEEN], UNSEEN: arms[SEEN]}, {SEEN: {}, UNSEEN: {}}):
         with pytest.raises(ValueError, match="arms: expected arms of different names in the report, got "):
             Evaluator(env, env.held_out, twice, unused)
@@ -122,9 +125,9 @@ def test_speed_limits_are_those_of_each_arm(evaluator):
 
 
 @pytest.mark.slow
-def test_the_zero_action_is_near_the_bound_of_each_arm(env):
+def test_the_zero_action_is_near_the_bound_of_each_arm(env, arms):
     zeros = jnp.zeros(env.action_size)
-    evaluator = Evaluator(env, env.held_out, report_arms(env.config), lambda: controller)
+    evaluator = Evaluator(env, env.held_out, arms, lambda: controller)
     controller = jax.device_get(jax.jit(lambda: evaluator.rollout(lambda state: zeros))())
     assert controller.qpos.shape == (len(NAMES) * HELD_OUT, HORIZON, MAX_JOINTS)
     assert not controller.qpos[2 * HELD_OUT : 3 * HELD_OUT, :, 6].any()  # joint 7 is locked in the third arm

@@ -46,7 +46,7 @@ FUNCTIONS = {
 }
 
 
-@pytest.mark.slow_for("imitate_trajectory", "kinematic_bound", "closest_motion", "warm", "soft")
+@pytest.mark.slow_for("key", "imitate_trajectory", "kinematic_bound", "closest_motion", "warm", "soft")
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_second_call_compiles_nothing(name):
     call, metric = FUNCTIONS[name]

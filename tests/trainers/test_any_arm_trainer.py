@@ -58,6 +58,7 @@ def test_it_evaluates_the_arms_of_the_report(trainer):
     assert trainer.evaluator.env.demonstrations.count == EVALUATED_DEMONSTRATIONS
 
 
+@pytest.mark.slow
 def test_other_demonstrations_keep_their_length(config, trainer):
     longer = make_ppo_trainer(config, None, trainer._demonstrations.of_length(7)).evaluator.env
     assert longer.config.horizon == 7 and longer.demonstrations.count == EVALUATED_DEMONSTRATIONS

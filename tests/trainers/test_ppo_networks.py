@@ -72,19 +72,21 @@ def test_what_was_constant_in_training_does_not_explode(policy, observations):
     statistics = running_statistics.update(
         running_statistics.init_state(specs.Array((SIZE,), jnp.dtype("float32"))), jnp.asarray(seen)
     )
-    actions = networks.policy_network.apply(statistics, policy[2], observations)
+    actions = jax.jit(networks.policy_network.apply)(statistics, policy[2], observations)
     unclipped = running_statistics.normalize(jnp.asarray(observations), statistics)
     assert np.abs(unclipped).max() > 1e5  # brax's own
-    params = networks.value_network.init(jax.random.PRNGKey(0))
-    timed = jnp.concatenate([observations, jnp.ones((5, 1))], axis=-1)
-    values = networks.value_network.apply(statistics, params, timed)
+    params = jax.jit(networks.value_network.init)(jax.random.PRNGKey(0))
+    timed = np.concatenate([observations, np.ones((5, 1), np.float32)], axis=-1)
+    values = jax.jit(networks.value_network.apply)(statistics, params, timed)
     assert np.abs(actions).max() < 100 and np.abs(values).max() < 100
 
 
 def test_missing_tokens_change_no_other():
-    module, tokens = Transformer(8, 2), jax.random.normal(jax.random.PRNGKey(0), (3, 6, 8))
-    present = jnp.arange(6) < 4
-    params = module.init(jax.random.PRNGKey(1), tokens, jnp.broadcast_to(present, (3, 6)))
-    other = jnp.where(present[:, None], tokens, 5.0)
-    outputs = [module.apply(params, x, jnp.broadcast_to(present, (3, 6))) for x in (tokens, other)]
-    np.testing.assert_allclose(outputs[0][:, :4], outputs[1][:, :4], atol=1e-6)  # type: ignore[index] - flax's type
+    module, tokens = Transformer(8, 2), np.random.default_rng(0).normal(size=(3, 6, 8)).astype(np.float32)
+    present = np.arange(6) < 4
+    everywhere = np.broadcast_to(present, (3, 6))
+    params = jax.jit(module.init)(jax.random.PRNGKey(1), tokens, everywhere)
+    other = np.where(present[:, None], tokens, np.float32(5.0))
+    apply = jax.jit(module.apply)
+    outputs = [np.asarray(apply(params, x, everywhere)) for x in (tokens, other)]
+    np.testing.assert_allclose(outputs[0][:, :4], outputs[1][:, :4], atol=1e-6)
