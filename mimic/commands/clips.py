@@ -1,4 +1,4 @@
-"""Content of a video as arrays: a policy's rollout, the poses of a pose mapper, or retargeted motions."""
+"""Content of a video as arrays: a policy's rollout, or retargeted motions."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -9,11 +9,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.arms.link_match import LinkMatch
-from mimic.arms.pose_limits import pose_limits
 from mimic.commands.config import RenderConfig
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
@@ -21,12 +19,10 @@ from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index, 
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line_table, similarity
 from mimic.motions.demonstrations import Demonstrations, load_demonstrations
-from mimic.motions.recording import record_demonstrations
 from mimic.retargeting.pose import imitate_pose
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.make import make_policy_trainer
-from mimic.trainers.pose_mapper.mapper import load_mapper
-from mimic.trainers.run_config import load_config, policy_run
+from mimic.trainers.run_config import policy_run
 
 FRAMES_PER_SECOND = 30
 _HOLD, _OPTIMUM = {"linestyle": ":", "color": "grey"}, {"linestyle": "--", "color": "black", "lw": 1}
@@ -92,15 +88,13 @@ def prepare_clip(config: RenderConfig) -> ClipPlan:
     """
     if config.retargeted or (config.demonstrations and not config.run):
         return _retargeted_clip(config)
-    if config.run and load_config(Path(config.run).expanduser()).trainer.name == "pose_mapper":
-        return _mapper_clip(config)
     return _policy_clip(config)
 
 
 def _policy_clip(config: RenderConfig) -> ClipPlan:
     """A policy's rollout, with the kinematic bound and the distance of holding the start pose."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
-    _check_unused(config, "a run of trainer=ppo", "demonstrations", "expert", "limits", "seed")
+    _check_unused(config, "run=DIR", "demonstrations", "expert", "limits")
     trained, trainer = make_policy_trainer(trained, run_dir, config.learner, config.locked)
     index = demonstration_index(trainer.evaluator, config.split, config.demonstration)
     _, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
@@ -127,44 +121,9 @@ def _policy_clip(config: RenderConfig) -> ClipPlan:
     return ClipPlan(trained.env, run_dir / "videos" / name, compute)
 
 
-def _mapper_clip(config: RenderConfig) -> ClipPlan:
-    """A demonstration of the expert, and the pose of the pose mapper at each frame."""
-    _check_unused(config, "a run of trainer=pose_mapper", "split", "learner", "locked", "expert", "limits")
-    run_dir = Path(config.run).expanduser()
-    mapper = load_mapper(run_dir, config.checkpoint)
-    env = dataclasses.replace(mapper.env, arms=None)
-    if config.demonstrations:
-        _check_unused(config, "demonstrations=FILE", "seed")
-        demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
-        _check_arm("demonstrations", demonstrations, mapper.expert)
-        _check_number(config.demonstration, demonstrations)
-        name = f"{Path(config.demonstrations).stem}-{config.demonstration}"
-    else:
-        demonstrations = None
-        name = f"{env.demonstrations.kind}-seed{config.seed}-{config.demonstration}"
-
-    def compute() -> Clip:
-        motions = demonstrations or record_demonstrations(
-            build_arm(env.expert, env.limits),
-            config.demonstration + 1,
-            kind=env.demonstrations.kind,
-            seed=config.seed,
-            horizon=env.horizon,
-            dt=env.control_dt,
-            substeps=env.substeps,
-        )
-        time, qpos = _resampled(motions, config.demonstration)
-        qpos = np.clip(qpos, *pose_limits(mapper.expert, float))  # cubic interpolation may exceed its samples slightly
-        learner_qpos = np.asarray(mapper(qpos.astype(np.float32)))
-        title = f"{env.name}, demonstration {config.demonstration}"
-        return _static_clip(env, title, time, qpos, learner_qpos, by="pose mapper")
-
-    return ClipPlan(env, run_dir / "videos" / f"{name}.mp4", compute)
-
-
 def _retargeted_clip(config: RenderConfig) -> ClipPlan:
     """A demonstration of the expert, and the learner's motion that `mimic.retarget` computed from it."""
-    _check_unused(config, "retargeted=FILE", "run", "checkpoint", "split", "seed", "locked")
+    _check_unused(config, "retargeted=FILE", "run", "checkpoint", "split", "locked")
     for key, example in (("demonstrations", "EXPERT.npz"), ("retargeted", "LEARNER.npz"), ("learner", "panda4dof")):
         if not getattr(config, key):
             raise ValueError(f"{key}: expected with retargeted=FILE, as in {key}={example}")
@@ -185,14 +144,12 @@ def _retargeted_clip(config: RenderConfig) -> ClipPlan:
         time, qpos = _resampled(demonstrations, config.demonstration)
         _, learner_qpos = _resampled(motions, config.demonstration)
         title = f"{env.name}, demonstration {config.demonstration}"
-        return _static_clip(env, title, time, qpos, learner_qpos, by="retargeted")
+        return _static_clip(env, title, time, qpos, learner_qpos)
 
     return ClipPlan(env, None, compute)
 
 
-def _static_clip(
-    env: EnvConfig, title: str, time: np.ndarray, qpos: np.ndarray, learner_qpos: np.ndarray, *, by: str
-) -> Clip:
+def _static_clip(env: EnvConfig, title: str, time: np.ndarray, qpos: np.ndarray, learner_qpos: np.ndarray) -> Clip:
     """A clip of static poses, whose velocities are ignored, with the distance of the optimal pose at each frame."""
     expert, learner = env.build_arms().embodiments
     metric = env.metric.build(expert, learner)
@@ -209,10 +166,10 @@ def _static_clip(
     optimum = imitate_pose(expert, learner, qpos.astype(np.float32), kept=None, **metric.arguments)
     curves = (
         Curve("holding the start pose", hold, _HOLD),
-        Curve(by, distance, {"color": "tab:blue"}),
+        Curve("retargeted", distance, {"color": "tab:blue"}),
         Curve("optimal poses", np.asarray(optimum.distance), _OPTIMUM),
     )
-    labels = "expert", f"learner, {by}"
+    labels = "expert", "learner, retargeted"
     poses = qpos, learner_qpos
     measures = _similarity((expert, learner), poses)
     match = env.metric.match_links(expert, learner)

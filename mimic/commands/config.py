@@ -121,16 +121,14 @@ class EvaluateConfig:
 
 @dataclasses.dataclass(frozen=True)
 class RenderConfig:
-    """Config of a video of a trained policy, of a pose mapper, or of retargeted motions.
+    """Config of a video of a trained policy, or of retargeted motions.
 
     Attributes:
-      run: run directory of a policy or a pose mapper.
+      run: run directory of a policy.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
       split: "held_out" or "train": demonstrations of a policy's run.
-      demonstration: index from 0 into the split, into the file, or into the demonstrations recorded for a pose mapper.
-      demonstrations: file of the expert's demonstrations. Default "": for a pose mapper, they are recorded with the
-        settings of its environment.
-      seed: seed of the recorded demonstrations.
+      demonstration: index from 0 into the split, or into the file.
+      demonstrations: file of the expert's demonstrations.
       retargeted: file of the learner's motions that `mimic.retarget` computed from `demonstrations`.
       learner: name of the environment that `retargeted` was computed for; of a run of many arms, name or file of the
         one that its policy moves.
@@ -146,7 +144,6 @@ class RenderConfig:
     split: str = "held_out"
     demonstration: int = number(0, at_least=0, at_most=1_000_000)
     demonstrations: str = ""
-    seed: int = number(0, at_least=0, at_most=2**63 - 1)
     retargeted: str = ""
     learner: str = ""
     locked: list[Any] = dataclasses.field(default_factory=list)

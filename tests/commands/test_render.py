@@ -1,11 +1,9 @@
-"""`python -m mimic.render` for pose mappers and retargeted motions: what videos show, and what is rejected."""
+"""`python -m mimic.render` for retargeted motions: what videos show, and what is rejected."""
 
 import dataclasses
 import functools
 
 import imageio_ffmpeg
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -21,24 +19,10 @@ from mimic.metric.similarity import centre_line, similarity
 from mimic.motions.demonstrations import Demonstrations
 from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
 from mimic.motions.mocap.link_motion import LinkMotion
-from mimic.motions.recording import record_demonstrations
-from mimic.trainers import run_training as train
-from mimic.trainers.config import PoseMapperConfig, TrainConfig
 
 STEPS = 2  # of a motion: 0.2 s, 7 frames
 EVERY = 3  # frames from one sample to the next, 0.1 s at 30 frames a second
-TINY = {"samples": 256, "batch_size": 64, "epochs": 4, "evaluations": 1, "hidden_layers": [16], "heads": 2}
 ROUNDING = 1e-5  # of distances of about 1 in float32
-
-
-@pytest.fixture(scope="module")
-def mapper_run(tmp_path_factory):
-    run_dir = tmp_path_factory.mktemp("mapper") / "run"
-    trainer = PoseMapperConfig(**TINY, validation_poses=16, held_out_poses=16)
-    env = env_config("planar4dof", horizon=STEPS)
-    config = TrainConfig(env, trainer, run_dir=str(run_dir), compilation_cache="")
-    assert train.prepare_training(config, 0.0)() == 0
-    return run_dir
 
 
 def swings(arm, count=2):
@@ -69,24 +53,6 @@ def plan(files):
 
 def curves(clip):
     return {curve.label: curve.values for curve in clip.curves}
-
-
-@pytest.mark.slow
-def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
-    plan = prepare_clip(RenderConfig(run=str(mapper_run), demonstration=1, seed=5))
-    clip, mapper = plan.compute(), mimic.PoseMapper.load(mapper_run)
-    assert plan.out == mapper_run / "videos" / "pd-seed5-1.mp4"
-    expert, learner = clip.poses
-    recorded = record_demonstrations(build_arm(plan.env.expert), 2, seed=5, horizon=STEPS)
-    np.testing.assert_allclose(expert[::EVERY], recorded.qpos[1], atol=1e-6)
-    np.testing.assert_allclose(learner, mapper(expert.astype(np.float32)), atol=ROUNDING)
-    shown = curves(clip)
-    expected = jax.vmap(mapper.distance)(jnp.asarray(expert), jnp.asarray(learner))
-    np.testing.assert_allclose(shown["pose mapper"], expected, atol=ROUNDING)
-    np.testing.assert_allclose(clip.bars.sum(axis=1), shown["pose mapper"], atol=ROUNDING)
-    assert np.all(shown["optimal poses"] <= np.minimum(shown["pose mapper"], shown["holding the start pose"]) + 1e-3)
-    stretched = mapper.distance(jnp.zeros(7), jnp.zeros(4))
-    assert shown["holding the start pose"][0] == pytest.approx(float(stretched), abs=ROUNDING)
 
 
 @pytest.mark.slow
@@ -151,7 +117,6 @@ def test_a_video_that_lacks_frames_is_removed(tmp_path, monkeypatch, options):
         ({"learner": "planar5dof"}, "unknown environment 'planar5dof'"),
         ({"demonstration": 2}, "demonstration: expected an index of the file from 0 to 1, got 2"),
         ({"run": "runs/NAME"}, "run: has no effect with retargeted=FILE"),
-        ({"seed": 1}, "seed: has no effect with retargeted=FILE"),
     ],
 )
 def test_bad_files_are_rejected_in_one_line(files, changes, message):
