@@ -15,13 +15,13 @@ from mimic.control.clearance import ClearanceConstants
 from mimic.control.joint_control import MODES, PERIOD, JointParameters, action_size
 from mimic.control.limits import JointLimits
 
-FORMAT = 3
-POLICY, FEATURES = "policy.onnx", "features.onnx"
+FORMAT = 4
+POLICY = "policy.onnx"
 CLEARANCE, CONTROLLER, MOTIONS = "clearance.npz", "controller.json", "motions.npz"
-_MODELS = POLICY, FEATURES, CLEARANCE
+_MODELS = POLICY, CLEARANCE
 _KEYS = (
     "format", "mimic_version", "mode", "period", "control_dt", "joint_names", "start_pose", "limits", "parameters",
-    "preview", "past_actions", "features", "expert_numbers", "robot", "hashes",
+    "preview", "past_actions", "expert_numbers", "robot", "hashes",
 )  # fmt: skip
 
 
@@ -40,7 +40,6 @@ class Bundle:
       parameters: of the inner loop, [joints] each.
       preview: number of later ticks whose expert states the policy observes.
       past_actions: number of its own actions that the policy observes.
-      features: number of those that it observes of the expert.
       expert_numbers: of the expert's link states at a tick.
       expert: [motions, ticks + 1, expert_numbers] the expert's link states at each tick.
       start_poses: [motions, joints] where each motion starts [rad].
@@ -58,7 +57,6 @@ class Bundle:
     parameters: JointParameters
     preview: int
     past_actions: int
-    features: int
     expert_numbers: int
     expert: np.ndarray
     start_poses: np.ndarray
@@ -105,7 +103,6 @@ def write_bundle(
     folder: Path,
     *,
     policy: bytes,
-    features: bytes,
     clearance: ClearanceConstants,
     controller: Mapping[str, Any],
     expert: np.ndarray,
@@ -116,14 +113,13 @@ def write_bundle(
 
     Args:
       folder: must not exist.
-      policy, features: ONNX models: the action, of measured and reference motions, past actions and features; the
-        features, of the expert's link states at a tick and the later ticks of the preview.
+      policy: ONNX model: the action, of measured and reference motions, past actions, and the expert's link states at a
+        tick and the later ticks of the preview.
       controller: what `controller.json` has, without `format`, `period`, `start_pose` and `hashes`.
       clearance, expert, start_poses, names: see `Bundle`.
     """
     folder.mkdir()
     (folder / POLICY).write_bytes(policy)
-    (folder / FEATURES).write_bytes(features)
     np.savez(folder / CLEARANCE, **clearance._asdict())
     content = {
         "format": FORMAT,
@@ -210,7 +206,6 @@ def _parsed(
             ),
             preview=int(content["preview"]),
             past_actions=int(content["past_actions"]),
-            features=int(content["features"]),
             expert_numbers=int(content["expert_numbers"]),
             expert=np.asarray(motions["expert"], np.float32),
             start_poses=np.asarray(motions["start_poses"], float),

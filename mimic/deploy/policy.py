@@ -1,4 +1,4 @@
-"""The networks of a bundle, run by onnxruntime on one thread."""
+"""The network of a bundle, run by onnxruntime on one thread."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,12 +8,12 @@ import numpy as np
 
 from mimic.base.files import read_bytes
 from mimic.control.joint_control import Reference
-from mimic.deploy.bundle import FEATURES, POLICY, Bundle
+from mimic.deploy.bundle import POLICY, Bundle
 
 if TYPE_CHECKING:
     import onnxruntime
 
-_OBSERVED = "qpos", "qvel", "reference_qpos", "reference_qvel"
+OBSERVED = "qpos", "qvel", "reference_qpos", "reference_qvel"  # measured motion, and that of the inner loop
 
 
 def open_session(path: Path, inputs: dict[str, int], outputs: dict[str, int]) -> "onnxruntime.InferenceSession":
@@ -61,33 +61,18 @@ class Policy:
 
     def __init__(self, bundle: Bundle, motions: Sequence[int]):
         joints, size = bundle.num_joints, bundle.action_size
-        self._features, self._row = _expert_features(bundle, motions)
+        self._expert, self._preview = bundle.expert[np.asarray(motions)], np.arange(bundle.preview + 1)
         self._past = np.zeros((len(motions), bundle.past_actions * size), np.float32)
-        sizes = dict.fromkeys(_OBSERVED, joints) | {"past_actions": self._past.shape[1], "features": bundle.features}
+        sizes = dict.fromkeys(OBSERVED, joints) | {"past_actions": self._past.shape[1]}
+        sizes["expert"] = len(self._preview) * bundle.expert_numbers
         self._session = open_session(bundle.folder / POLICY, sizes, {"action": size})
 
     def act(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> np.ndarray:
         """The actions [robots, numbers] at a tick, of measured and reference motions [robots, joints]."""
-        features = self._features[min(tick, len(self._features) - 1)][self._row]
-        observed = dict(zip(_OBSERVED, (qpos, qvel, reference.qpos, reference.qvel), strict=True))
-        feed = observed | {"past_actions": self._past, "features": features}
+        ahead = np.minimum(tick + self._preview, self._expert.shape[1] - 1)  # the expert's last state stays
+        feed = dict(zip(OBSERVED, (qpos, qvel, reference.qpos, reference.qvel), strict=True))
+        feed |= {"past_actions": self._past, "expert": self._expert[:, ahead].reshape(len(self._past), -1)}
         (action,) = self._session.run(["action"], {name: np.asarray(x, np.float32) for name, x in feed.items()})
         action = np.asarray(action)
         self._past = np.concatenate([action, self._past], axis=1)[:, : self._past.shape[1]]
         return action.astype(float)
-
-
-def _expert_features(bundle: Bundle, motions: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """What the policy computes from the expert alone, [ticks + 1, motions, numbers], and the motion of each robot.
-
-    At a tick these are the expert's states now and at the later ticks of the preview; its last state stays.
-    """
-    size = (bundle.preview + 1) * bundle.expert.shape[-1]
-    session = open_session(bundle.folder / FEATURES, {"expert": size}, {"features": bundle.features})
-    different, row = np.unique(motions, return_inverse=True)
-    ticks = np.arange(bundle.ticks + 1)
-    steps = np.minimum(ticks[:, None] + np.arange(bundle.preview + 1), bundle.ticks)
-    rows = [
-        session.run(["features"], {"expert": x[steps].reshape(len(ticks), -1)})[0] for x in bundle.expert[different]
-    ]
-    return np.stack(rows, axis=1), row

@@ -44,7 +44,7 @@ def test_a_policy_observes_what_it_was_exported_for(bundle, monkeypatch):
     last = feeds[-1]
     assert [last[name][0, 0] for name in ("qpos", "qvel", "reference_qpos", "reference_qvel")] == [1, 2, 3, 4]
     np.testing.assert_array_equal(last["past_actions"][0, ::7], [2, 1, 0])
-    phases = [feed["features"][0] for feed in feeds]
+    phases = [feed["expert"][0, :: 12 * bundles.LINKS] for feed in feeds]
     step = 2 * np.pi * bundles.CONTROL_DT
     np.testing.assert_allclose(phases[1], step * np.array([1, 2, 3]), rtol=1e-6)
     np.testing.assert_allclose(phases[2], step * bundle.ticks, rtol=1e-6)
@@ -72,7 +72,7 @@ BROKEN = {
     "no folder": (lambda folder: (folder / "policy.onnx").unlink(), "expected a folder of mimic.export"),
     "no JSON": (lambda folder: (folder / "controller.json").write_text("{"), "controller.json: expected JSON"),
     "no key": (lambda folder: (folder / "controller.json").write_text("{}"), "missing format, mimic_version"),
-    "another format": (lambda folder: changed(folder, format=1), "format: expected 3, got 1; export the run again"),
+    "another format": (lambda folder: changed(folder, format=1), "format: expected 4, got 1; export the run again"),
     "another network": (lambda folder: (folder / "policy.onnx").write_bytes(b"x"), "policy.onnx: expected the file"),
     "no motions": (lambda folder: (folder / "motions.npz").write_bytes(b"x"), "motions.npz: "),
     "a mode": (lambda folder: changed(folder, mode="flying"), "mode: expected one of torque, joint_position"),
@@ -96,9 +96,10 @@ def test_a_broken_bundle_is_rejected_in_one_line(bundle, damage, message):
     assert "\n" not in str(error.value)
 
 
-def test_a_network_with_other_inputs_is_rejected(bundle, tmp_path):
-    other = bundles.make_bundle(tmp_path / "other", features=(bundle.folder / "policy.onnx").read_bytes())
-    with pytest.raises(ValueError, match="features.onnx: inputs: expected expert \\[252\\], got features"):
+def test_a_network_with_other_inputs_is_rejected(tmp_path):
+    of_four = bundles.policy(4, 4, lambda values: values["qpos"])
+    other = bundles.make_bundle(tmp_path / "other", network=of_four)
+    with pytest.raises(ValueError, match="policy.onnx: inputs: expected expert \\[252\\], past_actions \\[21\\], qpos"):
         Policy(other, [0])
 
 

@@ -22,7 +22,7 @@ from mimic.trainers.export.onnx_model import to_onnx
 ON_FLOOR = np.array([0, 1.7, 0, -0.9, 0, 1.57, 0.785])  # poses in which a Panda touches the floor, and itself
 FOLDED = np.array([0, 0.6, 0, -3.05, 2.8, 3.7, 0])
 PREVIEW, PAST, LINKS, TICKS, CONTROL_DT = 2, 3, 7, 40, 0.05
-FEATURES, EXPERT = PREVIEW + 1, (PREVIEW + 1) * LINKS * 12
+EXPERT = (PREVIEW + 1) * LINKS * 12
 
 
 @functools.cache
@@ -50,7 +50,7 @@ def parameters(locked: tuple[int, ...] = ()) -> JointParameters:
 def policy(joints: int, size: int, action: Any) -> bytes:
     """A policy as ONNX; `action` gives the action of the six inputs by name."""
     inputs = {name: joints for name in ("qpos", "qvel", "reference_qpos", "reference_qvel")}
-    inputs |= {"past_actions": PAST * size, "features": FEATURES}
+    inputs |= {"past_actions": PAST * size, "expert": EXPERT}
     names = list(inputs)
 
     def function(*values: Any) -> dict[str, Any]:
@@ -61,15 +61,9 @@ def policy(joints: int, size: int, action: Any) -> bytes:
     return to_onnx(function, name="policy", inputs=inputs)
 
 
-@functools.cache
-def expert_phases() -> bytes:
-    """The first number of the expert now and at the later ticks of the preview, as ONNX."""
-    return to_onnx(lambda expert: {"features": expert[:: LINKS * 12]}, name="features", inputs={"expert": EXPERT})
-
-
 def sine(values: dict[str, Any]) -> Any:
     """A motion of all joints: the first number of the expert is its phase."""
-    phase = values["features"][0]
+    phase = values["expert"][0]
     return 0.4 * jnp.sin(phase + jnp.arange(values["qpos"].shape[0]))
 
 
@@ -87,7 +81,7 @@ def make_bundle(
     start_poses: np.ndarray | None = None,
     ticks: int = TICKS,
     clearance: ClearanceConstants | None = None,
-    features: bytes | None = None,
+    network: bytes | None = None,
 ) -> Any:
     """Writes a bundle for a Panda and loads it."""
     arm, locked = panda(tuple(locked)), tuple(locked)
@@ -98,8 +92,7 @@ def make_bundle(
     expert[:, :, 0] = 2 * np.pi * CONTROL_DT * np.arange(ticks + 1)  # one cycle a second
     write_bundle(
         folder,
-        policy=policy(joints, action_size(mode, joints), action),
-        features=features or expert_phases(),
+        policy=network or policy(joints, action_size(mode, joints), action),
         clearance=clearance or panda_clearance(locked),
         controller={
             "mimic_version": "test",
@@ -111,7 +104,6 @@ def make_bundle(
             "parameters": {name: x.tolist() for name, x in parameters(locked)._asdict().items()},
             "preview": PREVIEW,
             "past_actions": PAST,
-            "features": FEATURES,
             "expert_numbers": 12 * LINKS,
         },
         expert=expert,

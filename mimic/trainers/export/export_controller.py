@@ -5,6 +5,7 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import jax
@@ -16,11 +17,12 @@ from mimic.base.distribution import VERSION
 from mimic.control import joint_control
 from mimic.control.joint_control import JointParameters
 from mimic.deploy.bundle import write_bundle
+from mimic.deploy.policy import OBSERVED
 from mimic.deploy.safety import check_supported
-from mimic.envs.imitation import link_layout, observed_parts
-from mimic.envs.world_env import SENT_ACTIONS, HardwareEnv
+from mimic.envs.imitation import observed_parts
+from mimic.envs.world_env import SENT_ACTIONS, HardwareEnv, control_observation
 from mimic.metric.capsule_distances import clearance_constants
-from mimic.metric.kinematics import LinkStates, link_states
+from mimic.metric.kinematics import LinkStates
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.export.onnx_model import to_onnx
@@ -61,13 +63,11 @@ def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable
     def write(out: Path) -> None:
         partial = Path(tempfile.mkdtemp(prefix=".mimic-", dir=out.absolute().parent))
         try:
-            features, policy = _policy_graphs(env, jax.device_get(params))
             write_bundle(
                 partial / "bundle",
-                policy=policy,
-                features=features,
+                policy=_policy_graph(env, config, jax.device_get(params)),
                 clearance=clearance_constants(env.learner, env.capsules, env.world.floor_height),
-                controller=_description(env, steps) | {"features": config.hidden_layers[0]},
+                controller=_description(env, steps),
                 expert=expert_table(env),
                 start_poses=np.asarray(env.start_poses, float),
                 names=[f"demonstration {index}" for index in range(env.demonstrations.count)],
@@ -86,46 +86,21 @@ def expert_table(env: HardwareEnv) -> np.ndarray:
     return np.concatenate(parts, axis=-1).astype(np.float32)
 
 
-def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
-    """What the first layer adds up from the expert's link states, and the policy from that and its other observations.
-
-    The states of the expert are five sixths of an observation and known before a motion. The test of the export
-    compares with `control_observation` and the policy of `ppo.make_controller`.
-    """
-    statistics, policy, *_ = params
-    layers = [policy["params"][f"hidden_{index}"] for index in range(len(policy["params"]))]
-    layout = link_layout(env.expert, env.learner, env.config.preview)
-    own_links = next(part["start"] for part in layout if part["name"].startswith("expert"))
-    joints, expert_size = env.learner.num_joints, layout[-1]["stop"] - own_links
-    is_expert = np.zeros(env.observation_size, bool)
-    is_expert[own_links : own_links + expert_size] = True
-    mean = np.array(statistics.mean)
-    mean[own_links + expert_size :][:joints] += np.asarray(env.learner.home)  # the policy observes the difference
-    first_kernel = np.asarray(layers[0]["kernel"]) / np.asarray(statistics.std)[:, None]
-
-    def first_layer(part: np.ndarray, values: jax.Array) -> jax.Array:
-        return (values - mean[part]) @ first_kernel[part]
-
-    def features(expert: jax.Array) -> dict[str, jax.Array]:
-        return {"features": first_layer(is_expert, expert) + layers[0]["bias"]}
+def _policy_graph(env: HardwareEnv, config: PPOConfig, params: Any) -> bytes:
+    """The policy, of what is measured, its last actions, and the expert's states now and in the preview."""
+    act = ppo.make_controller(config, env.observation_size, env.action_size)(params)
 
     def action(*values: jax.Array) -> dict[str, jax.Array]:
-        qpos, qvel, reference_qpos, reference_qvel, past_actions, features = values
-        states = [part.ravel() for part in observed_parts(link_states(env.learner, qpos, qvel))]
-        own = jnp.concatenate([*states, reference_qpos, reference_qvel, past_actions])
-        hidden = features + first_layer(~is_expert, own)
-        for layer in layers[1:-1]:
-            hidden = jax.nn.silu(hidden) @ layer["kernel"] + layer["bias"]
-        kernel, bias = (layers[-1][name][..., : env.action_size] for name in ("kernel", "bias"))  # no deviation
-        return {"action": jax.lax.clamp(-1.0, jnp.tanh(jax.nn.silu(hidden) @ kernel + bias), 1.0)}
+        *measured, past_actions, expert = values
+        observation = control_observation(env, jnp.concatenate(measured), past_actions, expert)
+        return {"action": act(SimpleNamespace(obs=observation))}  # type: ignore[arg-type]
 
-    inputs: dict[str, int] = dict.fromkeys(("qpos", "qvel", "reference_qpos", "reference_qvel"), joints)
-    inputs |= {"past_actions": SENT_ACTIONS * env.action_size, "features": len(layers[0]["bias"])}
-    metadata = {"mimic_version": VERSION}
-    return (
-        to_onnx(features, name="features", inputs={"expert": expert_size}, metadata=metadata),
-        to_onnx(action, name="policy", inputs=inputs, metadata=metadata),
-    )
+    inputs: dict[str, int] = dict.fromkeys(OBSERVED, env.learner.num_joints)
+    inputs |= {
+        "past_actions": SENT_ACTIONS * env.action_size,
+        "expert": (env.config.preview + 1) * expert_table(env).shape[-1],
+    }
+    return to_onnx(action, name="policy", inputs=inputs, metadata={"mimic_version": VERSION})
 
 
 def _description(env: HardwareEnv, steps: int) -> dict[str, Any]:
