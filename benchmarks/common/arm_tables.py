@@ -186,3 +186,31 @@ def captured_policies(results: Results) -> list[Cells]:
         distances = [span([run[key]["held_out"] for run in runs], ".3f", 1) for key in keys]
         rows.append((clip, arm, learner, str(len(runs)), *gaps, ", ".join(distances)))
     return rows
+
+
+# Data sets of other arms
+
+
+def transfers(results: Results) -> list[Cells]:
+    """Demonstrations on each arm: how many keep all hands, and how many succeed in robosuite by each method."""
+    rows: list[Cells] = [("arm", "exact in all frames", "frames", "succeed in robosuite", "ssik", "joints copied")]
+    learners = list(dict.fromkeys(row["learner"] for row in results["pairs"]))
+    for name in [learners, *([learner] for learner in learners)]:
+        pairs = [row for row in results["pairs"] if row["learner"] in name]
+        frames = sum(row["exact"] for row in pairs) / sum(row["frames"] for row in pairs)
+        replays = [row for row in results["physics"] if row["learner"] in name]
+        succeed = [
+            sum(row["success"] for row in where(replays, method=method)) for method in ("mimic", "ssik", "copied")
+        ]
+        exact = sum(row["exact"] == row["frames"] for row in pairs)
+        counts = [f"{count} of {len(pairs)}" for count in (exact, *succeed)]
+        rows.append((name[0] if len(name) == 1 else "all", counts[0], percent(frames), *counts[1:]))
+    return rows
+
+
+def transferred_teleoperation(results: Results) -> list[Cells]:
+    rows: list[Cells] = [("mapping", "hand's direction, mean [deg]", "hand's position, median / 95 % [mm]")]
+    for row in results["teleoperation"]:
+        places = f"{row['position_mm_p50']:.1f} / {row['position_mm_p95']:.1f}"
+        rows.append((row["method"], f"{row['hand_direction_deg']:.1f}", places))
+    return rows

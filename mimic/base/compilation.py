@@ -10,7 +10,7 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -38,6 +38,7 @@ _COLLECTIVES_IN_GRAPHS = {
 
 # A fifth less to compile on a CPU than XLA's default, 3; what is computed here is as fast, to 2 %.
 _QUICK_CPU_OPTIONS = {"xla_backend_optimization_level": 1}
+UNOPTIMIZED = {"xla_backend_optimization_level": 0}  # half to compile again, for what takes little time to run
 _KEPT_RESULTS = 32  # of each function that is cached by value; a compiled function takes some MB
 
 T = TypeVar("T")
@@ -121,16 +122,19 @@ def by_value(function: Callable[..., T], uncached: Callable[..., T] | None = Non
     return lookup
 
 
-def compiled_once(make: Callable[..., Callable[..., T]]) -> Callable[..., Callable[..., T]]:
+def compiled_once(
+    make: Callable[..., Callable[..., T]], options: Mapping[str, Any] = _QUICK_CPU_OPTIONS
+) -> Callable[..., Callable[..., T]]:
     """A maker of functions that returns the same compiled function for equal arguments: see `by_value`.
 
     Args:
       make: from arguments that are constant in the compiled function to a function of arrays, at least one of them made
         by `jax.numpy`, so that it is a tracer while JAX traces.
+      options: of XLA on a CPU.
     """
 
     def compiled(*arguments: Any) -> Callable[..., T]:
-        return _compiled(make(*arguments))
+        return _compiled(make(*arguments), options)
 
     def of_trace(*arguments: Any) -> Callable[..., T]:
         return jax.jit(make(*arguments))
@@ -138,10 +142,10 @@ def compiled_once(make: Callable[..., Callable[..., T]]) -> Callable[..., Callab
     return functools.wraps(make)(by_value(compiled, of_trace))
 
 
-def _compiled(function: Callable[..., T]) -> Callable[..., T]:
+def _compiled(function: Callable[..., T], options: Mapping[str, Any]) -> Callable[..., T]:
     """The function, compiled quickly for concrete arrays; inside a trace it becomes part of that."""
     traced = jax.jit(function)
-    quick = jax.jit(function, compiler_options=_quick_options())  # JAX takes options only outside of a trace
+    quick = jax.jit(function, compiler_options=_quick_options(options))  # JAX takes options only outside of a trace
 
     def call(*arrays: Any) -> T:
         return traced(*arrays) if has_tracer(arrays) else quick(*arrays)
@@ -198,11 +202,11 @@ def _leaf_key(leaf: Any) -> Hashable:
     return type(leaf), leaf
 
 
-def _quick_options() -> dict[str, Any]:
+def _quick_options(options: Mapping[str, Any] = _QUICK_CPU_OPTIONS) -> dict[str, Any]:
     """XLA's options for a function that compiles quickly on a CPU, without those that XLA_FLAGS sets."""
     if jax.default_backend() != "cpu":
         return {}
-    return _without_those_of_user(_QUICK_CPU_OPTIONS)
+    return _without_those_of_user(dict(options))
 
 
 def compiler_options() -> dict[str, Any]:

@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +34,7 @@ from mimic.runs.files import finite, written_atomically
 
 _REPORT, _PICTURE = "report.json", "certificate.png"
 _WARNING = "warning"  # how notes begin that are printed before the work
+_THREADS = 8  # at most; each holds an episode
 _SHOWN = 12  # episodes in the table; those that fail come first
 _POSITION_ALONE = 0.5  # of the frames that fail: with so many whose hand is at its place, the rotation is what fails
 
@@ -81,11 +84,12 @@ def prepare_data_set(config: RetargetConfig) -> Callable[[], int]:
         used = _with_base(setting, config.base, data, console)
         motions: dict[str, dict[str, Motion]] = {entry: {} for entry in data.motions}
         certificates = {}
-        for number, name in enumerate(data.measured, start=1):
-            with console.status(f"retargeting {name}, {number} of {len(data.measured)}, to {learner.name}"):
-                found, certificates[name] = retarget_episode(data, name, used)
-            for entry, motion in found.items():
-                motions[entry][name] = motion
+        with console.status(f"retargeting {len(data.measured)} episodes to {learner.name}") as status:
+            for number, (name, (found, certificate)) in enumerate(_retargeted(data, used), start=1):
+                status.update(f"retargeting to {learner.name}: {number} of {len(data.measured)} episodes")
+                certificates[name] = certificate
+                for entry, motion in found.items():
+                    motions[entry][name] = motion
         kept = [name for name, item in certificates.items() if item.is_ok or config.failing == "kept"]
         if not kept:
             _print(console, data, certificates, kept, used, ())
@@ -102,6 +106,14 @@ def prepare_data_set(config: RetargetConfig) -> Callable[[], int]:
         return 0
 
     return run
+
+
+def _retargeted(data: DataSet, setting: _Setting) -> Iterator[tuple[str, tuple[dict[str, Motion], Certificate]]]:
+    """Each episode's name, motions and certificate; the first one compiles, and the others are computed in threads."""
+    first, *others = data.measured
+    yield first, retarget_episode(data, first, setting)
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as pool:
+        yield from zip(others, pool.map(lambda name: retarget_episode(data, name, setting), others), strict=True)
 
 
 def retarget_episode(data: DataSet, name: str, setting: _Setting) -> tuple[dict[str, Motion], Certificate]:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.motions.cleaning import OVERSHOOT, Notes, cleaned
-from mimic.motions.evidence import doubts
+from mimic.motions.doubts import doubts
 from mimic.motions.formats.episodes import Motion, Recording
 from mimic.motions.formats.hdf5 import is_hdf5
 from mimic.motions.formats.hdf5_rewriting import rewrite_hdf5

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints, motion_limits, pose_limits
-from mimic.base.compilation import by_value, compiled_once, in_background
+from mimic.base.compilation import UNOPTIMIZED, by_value, compiled_once, in_background
 from mimic.metric.distance import Metric
 from mimic.retargeting.costs import NO_COSTS, Costs
 from mimic.retargeting.exact_chunks import CHUNK, by_chunks, hand_report, in_chunks
@@ -121,7 +121,7 @@ def _candidates(*arms: Any) -> Callable[..., Candidates]:
     return chunk
 
 
-@compiled_once
+@functools.partial(compiled_once, options=UNOPTIMIZED)
 def _branches(*arms: Any) -> Callable[..., Array]:
     """The function from poses at the anchors, a placement and random poses to postures on different branches."""
     solver = exact_solver(*arms)

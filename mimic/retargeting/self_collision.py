@@ -1,5 +1,6 @@
 """Motions in which links touch each other or the floor."""
 
+import copy
 from collections.abc import Callable
 
 import jax
@@ -42,20 +43,25 @@ def make_contacts(
       ValueError: what `build_arm` rejects.
     """
     arm, model = build_arm(config, limits), arm_spec(config).compile()
-    data = data_at_zero(model)
+    start = data_at_zero(model)
     for name, angle in arm.locked.items():
-        data.qpos[model.joint(name).qposadr[0]] = angle
+        start.qpos[model.joint(name).qposadr[0]] = angle
     address = np.array([model.joint(name).qposadr[0] for name in arm.embodiment.joint_names])
 
-    def touching(qpos: np.ndarray) -> set[tuple[int, int]]:
+    def touching(qpos: np.ndarray, data: mujoco.MjData) -> set[tuple[int, int]]:
         data.qpos[address] = qpos
         for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_collision):  # what collisions need
             compute(model, data)
         pairs = model.geom_bodyid[data.contact.geom[data.contact.dist < 0]]
         return set(map(tuple, pairs.tolist()))
 
-    always = touching(np.asarray(arm.embodiment.home, float))
-    return lambda qpos: np.array([bool(touching(pose) - always) for pose in qpos], bool)
+    always = touching(np.asarray(arm.embodiment.home, float), start)
+
+    def contacts(qpos: np.ndarray) -> np.ndarray:
+        data = copy.copy(start)  # each thread has its own
+        return np.array([bool(touching(pose, data) - always) for pose in qpos], bool)
+
+    return contacts
 
 
 def touching_line(clearances: Float[np.ndarray, " motions"], noun: str = "demonstrations") -> str:
