@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.commands import retarget_data
 from mimic.commands.retarget import retarget
+from mimic.retargeting.certificate import Certificate
 from tests.helpers.commands import run
 
 
@@ -91,3 +93,18 @@ def test_a_data_set_of_one_arm_becomes_one_of_another(tmp_path):
     assert (out / "certificate.png").stat().st_size > 10_000
     found = np.stack([written[name] for name in mimic.panda().joint_names[:6]], axis=1)
     np.testing.assert_allclose(found, qpos[:, :6], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("failing", "chosen"), [([5, 3, 0, 1], 2), ([5, 3, 4, 6], 1), ([0, 9, 9, 9], 0), ([90, 0, 0, 0], 0)]
+)
+def test_an_episode_of_which_few_frames_fail_is_searched_again(monkeypatch, failing, chosen):
+    def of_seed(_, name, setting):
+        causes = ("hand out of reach",) * failing[setting.seed] + ("",) * (100 - failing[setting.seed])
+        return setting.seed, Certificate(*[np.zeros(100)] * 5, causes)
+
+    monkeypatch.setattr(retarget_data, "_retarget_from", of_seed)
+    setting = retarget_data._Setting(*[None] * 6, 0, *[None] * 4)  # type: ignore[arg-type]
+    found, certificate = retarget_data.retarget_episode(None, "", setting)  # type: ignore[arg-type]
+    assert found == chosen
+    assert sum(map(bool, certificate.causes)) == failing[chosen]
