@@ -59,6 +59,7 @@ from .retargeting.pose import PoseImitation as PoseImitation
 from .retargeting.pose import imitate_pose as imitate_pose
 from .retargeting.teleoperation import FollowerCommand as FollowerCommand
 from .retargeting.teleoperation import Teleoperator as Teleoperator
+from .retargeting.teleoperation_recording import TeleoperationRecorder as TeleoperationRecorder
 from .retargeting.trajectory import imitate_trajectory as imitate_trajectory
 from .trainers.export.export import export_run as export_run
 from .trainers.pose_mapper.mapper import AnyArmMapper as AnyArmMapper

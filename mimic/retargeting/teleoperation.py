@@ -90,6 +90,11 @@ class Teleoperator:
       metric: of postures.
       grippers: (closed, open) of the leader and of the follower, in the units of each.
 
+    Attributes:
+      limits: of the follower.
+      period: of a tick [s].
+      engagements: number of times that the clutch was engaged.
+
     Raises:
       ValueError: an argument out of range, no velocity limit, a metric that is no weighted sum, or no ruckig.
     """
@@ -113,7 +118,7 @@ class Teleoperator:
         for name, number in (("scale", scale), ("rate", rate)):
             if not (np.isfinite(number) and number > 0):
                 raise ValueError(f"{name}: expected a finite number above 0, got {number}")
-        self._period, self._is_relative = 1.0 / rate, hand == "relative"
+        self.period, self._is_relative = 1.0 / rate, hand == "relative"
         self.limits = limits or follower_limits(follower, velocity)
         self.leader, self.follower = leader, follower
         self._rows = ArmRows(leader), ArmRows(follower)
@@ -127,14 +132,15 @@ class Teleoperator:
         self._leader_hands, self._follower_hands = (
             rows.hand_rows(hands) for rows, hands in zip(self._rows, self._pairs.T, strict=True)
         )
-        self._samples = _Samples(leader, self._period)
-        self._gripper = _Gripper(*grippers, self._period)
-        self._limiter = _Limiter(self.limits, self._period)
-        self._steps = int(np.clip(np.ceil(self._period / _STEP_TIME), 1, _MAX_STEPS))
-        self._smoothing = float(1 - np.exp(-self._period / _SPEED_TIME))
-        self._reach = self.limits.velocity * self._period
+        self._samples = _Samples(leader, self.period)
+        self._gripper = _Gripper(*grippers, self.period)
+        self._limiter = _Limiter(self.limits, self.period)
+        self._steps = int(np.clip(np.ceil(self.period / _STEP_TIME), 1, _MAX_STEPS))
+        self._smoothing = float(1 - np.exp(-self.period / _SPEED_TIME))
+        self._reach = self.limits.velocity * self.period
         self._random = np.random.default_rng(0)
         self._lower, self._upper = self.limits.position.T
+        self.engagements = 0
         self.reset(np.clip(follower.home, self._lower, self._upper))
 
     def reset(self, qpos: Float[np.ndarray, " joints"]) -> None:
@@ -154,6 +160,7 @@ class Teleoperator:
     def engage(self) -> None:
         """Lets the next sample lead: with "relative" from here, with "exact" by an approach of limited speed."""
         self.is_engaged, self._anchor, self._goal = True, None, None
+        self.engagements += 1
         self._posture = self._path = self._limiter.qpos
         self._speed, self._posture_rows, self._is_reached = np.zeros_like(self._path), None, True
         self._left = FAR
@@ -163,6 +170,16 @@ class Teleoperator:
         """Brakes the follower, which then stays where it is."""
         self.is_engaged, self._goal = False, None
         self._samples.forget()
+
+    @property
+    def qpos(self) -> Float[np.ndarray, " joints"]:
+        """The last command [rad]."""
+        return self._limiter.qpos
+
+    @property
+    def leader_qpos(self) -> Float[np.ndarray, " leader_joints"] | None:
+        """The last sample that counted [rad]; None before the first one since `engage`."""
+        return None if self._goal is None else self._samples.last
 
     @property
     def goal(self) -> tuple[Float[np.ndarray, "hands 3"], Float[np.ndarray, "hands 3 3"]] | None:
@@ -235,7 +252,7 @@ class Teleoperator:
         # A path that goes as fast as it may ends at once, where the command must be able to stop.
         is_free = self._is_near and fraction < _FREE
         kept = 1 - self._smoothing
-        self._speed = kept * self._speed + self._smoothing / self._period * moved if is_free else 0 * moved
+        self._speed = kept * self._speed + self._smoothing / self.period * moved if is_free else 0 * moved
         self._search(goal)
         if self._lanes is not None and not self._is_near:
             return  # where an approach goes is not known yet
@@ -249,7 +266,7 @@ class Teleoperator:
         """Searches other branches at the start of an approach, and while the hand is not reached, a step in a tick."""
         if self._lanes is None:
             is_well = self._is_reached or not self._is_near
-            self._stuck = 0.0 if is_well else self._stuck + self._period
+            self._stuck = 0.0 if is_well else self._stuck + self.period
             if self._is_near and self._stuck < _STUCK:
                 return
             if not self._is_near and self._rounds:
@@ -327,6 +344,7 @@ class _Samples:
     Attributes:
       reason: why the last sample was ignored; empty where it was not.
       age: time since the last sample that was accepted [s].
+      last: that sample [rad].
     """
 
     def __init__(self, leader: Embodiment, period: float):
@@ -335,7 +353,7 @@ class _Samples:
 
     def forget(self) -> None:
         """Takes the next sample wherever it is."""
-        self.reason, self.age, self._last, self._newest = "", 0.0, None, -np.inf
+        self.reason, self.age, self.last, self._newest = "", 0.0, None, -np.inf
         self._jumped, self._agreeing, self._backwards = None, 0.0, 0.0
 
     def accept(self, qpos: Any, time: float | None) -> np.ndarray | None:
@@ -354,7 +372,7 @@ class _Samples:
         elif self._is_jump(sample):
             self.reason = "ignored a sample that jumped"
         else:
-            self._last, self.age, self._jumped = sample, 0.0, None
+            self.last, self.age, self._jumped = sample, 0.0, None
             return sample
         return None
 
@@ -367,9 +385,9 @@ class _Samples:
 
     def _is_jump(self, sample: np.ndarray) -> bool:
         reach = _MAX_SPEED * max(self.age, self._period)
-        if self._last is None:
+        if self.last is None:
             return False
-        moved = sample - self._last
+        moved = sample - self.last
         if moved.dot(moved) <= reach**2 or np.abs(wrap_angles(moved, self._continuous)).max() <= reach:
             return False  # the norm is checked first because it is fast
         before, self._jumped = self._jumped, sample

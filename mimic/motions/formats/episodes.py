@@ -94,6 +94,7 @@ class ArmMotions:
       quantity: what the commands are.
       gripper: [N, T+1, m] joints or opening of its gripper, in the units of their source; None if unknown.
       gripper_names: its channels.
+      gripper_command: [N, T, m] what was commanded of them; None if unknown.
     """
 
     arm: str
@@ -104,6 +105,7 @@ class ArmMotions:
     quantity: Quantity = TORQUE
     gripper: Float[np.ndarray, "episodes samples channels"] | None = None
     gripper_names: tuple[str, ...] = ()
+    gripper_command: Float[np.ndarray, "episodes steps channels"] | None = None
 
 
 @dataclasses.dataclass(frozen=True)

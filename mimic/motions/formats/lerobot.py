@@ -102,7 +102,8 @@ def _features(episodes: Episodes) -> dict[str, dict[str, Any]]:
         names = [EXPERT + name for name in expert.joint_names]
         gripper = [EXPERT + name for name in expert.gripper_names]
         features[EXPERT_STATE] = _joint_feature(names, (ANGLE, VELOCITY), gripper)
-    features[ACTION] = _joint_feature(robot.joint_names, (action_of(robot)[1],))
+    commanded = () if robot.gripper_command is None else robot.gripper_names
+    features[ACTION] = _joint_feature(robot.joint_names, (action_of(robot)[1],), commanded)
     features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None, "units": ["s"]}
     return features | {name: {"dtype": "int64", "shape": [1], "names": None} for name in _INDICES}
 
@@ -122,7 +123,8 @@ def _columns(episodes: Episodes, fps: int) -> dict[str, np.ndarray]:
     values = {STATE: _states(episodes.robot)}
     if episodes.expert is not None:
         values[EXPERT_STATE] = _states(episodes.expert)
-    values[ACTION] = action_of(episodes.robot)[0]
+    gripper = episodes.robot.gripper_command
+    values[ACTION] = np.concatenate([action_of(episodes.robot)[0], *([] if gripper is None else [gripper])], axis=-1)
     columns = {
         name: np.concatenate([array[: steps[i]] for i, array in enumerate(all_steps)]).astype(np.float32)
         for name, all_steps in values.items()
