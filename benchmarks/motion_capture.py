@@ -8,8 +8,7 @@ Each arm of each clip is retargeted to the Panda, with and without locked joints
 robosuite in FOLDER. Methods: `imitate_trajectory` with angles and positions of links that are cut alike, without and
 with the cost of the hand, and with the default metric; a pose mapper that was trained on the poses of the same arm of
 the clip, with the metric of the first; inverse kinematics of the scaled hand by mink, and of frames of the links as GMR
-does it; the closed form that aligns shoulder, elbow and wrist; holding the home pose. Besides the measures
-of similarity: the largest speed of a joint between two samples
+does it; holding the home pose. Besides the measures of similarity: the largest speed of a joint between two samples
 [rad/s], and the root mean square of the joints' jerk [rad/s^3], at the captured speed.
 """
 
@@ -26,7 +25,7 @@ from benchmarks.common.cut_links import cut_alike
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.peers.frame_matching import match_frames
-from benchmarks.peers.segment_alignment import Landmarks, align_segments
+from benchmarks.peers.landmarks import Landmarks
 from benchmarks.similarity import other_arms
 from mimic.arms.arm import ArmConfig
 from mimic.commands.capture import fixed_fraction, read_arm
@@ -133,7 +132,6 @@ METHODS: dict[str, Callable[[Case], np.ndarray | None]] = {
     "pose_mapper": lambda case: mapped(with_cut_links(case)),
     "hand_ik": lambda case: hand_ik(case.expert, case.learner, case.qpos, every=1),
     "frame_matching": lambda case: match_frames(case.expert, case.learner, case.qpos, case.marks),
-    "align_segments": lambda case: align_segments(case.expert, case.learner, case.qpos, expert_marks=case.marks),
     "hold_home": lambda case: hold_home(case.expert, case.learner, case.qpos),
 }
 

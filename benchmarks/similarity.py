@@ -23,11 +23,11 @@ import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, write_results
 from benchmarks.figures import similarity_front
-from benchmarks.peers.segment_alignment import ALL_BASELINES
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.metric.similarity import centre_line_table, similarity
+from mimic.retargeting.pose_baselines import BASELINES
 
 TRANSLATIONS = 0.0, 0.25, 0.5, 1.0, 2.0, 4.0  # weights; that of rotation is 1
 SOME_TRANSLATIONS = 0.0, 0.5, 2.0
@@ -119,7 +119,7 @@ def run_pair(pair: EnvConfig, demonstrations: int, random: int, *, hands: bool =
         means = {name: [round(float(x), 5) for x in (v.mean(), np.quantile(v, 0.9))] for name, v in values.items()}
         rows.append({"pair": pair.name, "set": kind, "poses": len(qpos), "method": method, "measures": means})
 
-    for (kind, motion), (baseline, function) in itertools.product(motions.items(), ALL_BASELINES.items()):
+    for (kind, motion), (baseline, function) in itertools.product(motions.items(), BASELINES.items()):
         posed = function(expert, learner, motion)
         if posed is not None:
             add(baseline, kind, learner, posed[:, ::every].reshape(-1, learner.num_joints))

@@ -132,7 +132,6 @@ METHODS = {
     "mimic": "`imitate_trajectory`",
     "mimic_hand": "with the hand cost",
     "pose_mapper": "pose mapper",
-    "align_segments": "aligning segments",
     "frame_matching": "GMR's way",
     "hand_ik": "IK of the hand",
 }

@@ -250,7 +250,6 @@ def pretrained(reports: Results) -> list[Cells]:
 
 CANDIDATES = {
     "hand_ik": "hand IK",
-    "align_segments": "align segments",
     "kept arc_length 0": "links kept, arc length, 0",
     "kept arc_length 1": "**links kept, arc length, 1**",
     "kept arc_length 2": "links kept, arc length, 2",

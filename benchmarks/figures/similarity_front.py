@@ -8,8 +8,8 @@ import numpy as np
 
 from benchmarks.common.record import Row, print_table
 from benchmarks.figures.canvas import plt, save
-from benchmarks.peers.segment_alignment import ALL_BASELINES
 from mimic.metric.similarity import MEASURES
+from mimic.retargeting.pose_baselines import BASELINES
 
 FRONT = ("centre_line_distance", "tangent_angle_deg", "hand_position_error", "hand_angle_deg")  # a candidate's aims
 SLACK = {"hand_position_error": 1.05}  # multiple of the baseline's value that is no loss; 1 for the others
@@ -73,7 +73,7 @@ def pareto_front(compared: dict[str, dict[str, Any]]) -> list[str]:
     ratios = {
         method: np.array([result[name]["ratio"] for name in FRONT])
         for method, result in compared.items()
-        if method not in ALL_BASELINES and all(result[name]["ratio"] is not None for name in FRONT)
+        if method not in BASELINES and all(result[name]["ratio"] is not None for name in FRONT)
     }
     others = ratios.values()
     return [key for key, own in ratios.items() if not any(np.all(x <= own) and np.any(x < own) for x in others)]
@@ -93,7 +93,7 @@ def plot(rows: Sequence[Row], path: Path) -> None:
     front = pareto_front(compared)
     families: dict[str, list[str]] = {}
     for method in compared:
-        families.setdefault(method if method in ALL_BASELINES else method.rpartition(" ")[0], []).append(method)
+        families.setdefault(method if method in BASELINES else method.rpartition(" ")[0], []).append(method)
     figure, panels = plt.subplots(1, 2, figsize=(10.5, 4.6), layout="constrained")
     for axes, names in zip(panels, (FRONT[:2], FRONT[2:]), strict=True):
         for family, methods in families.items():
@@ -101,8 +101,8 @@ def plot(rows: Sequence[Row], path: Path) -> None:
             (line,) = axes.plot(*np.transpose(points), lw=1, label=family.replace("_", " "))
             for method, point in zip(methods, points, strict=True):
                 fill = line.get_color() if method in front else "white"
-                axes.plot(*point, "s" if method in ALL_BASELINES else "o", ms=7, color=line.get_color(), mfc=fill)
-                weight = "" if method in ALL_BASELINES else method.rpartition(" ")[2]
+                axes.plot(*point, "s" if method in BASELINES else "o", ms=7, color=line.get_color(), mfc=fill)
+                weight = "" if method in BASELINES else method.rpartition(" ")[2]
                 axes.annotate(weight, point, xytext=(5, 5), textcoords="offset points", fontsize=8)
         axes.set(xlim=(0, 1.5), ylim=(0, 1.5), xlabel=f"{names[0]}, relative to copying", ylabel=names[1])
         axes.grid(alpha=0.25)

@@ -11,7 +11,7 @@ from typing import Any
 import mink
 import numpy as np
 
-from benchmarks.peers.segment_alignment import Landmarks, landmarks, part_directions
+from benchmarks.peers.landmarks import Landmarks, landmarks, part_directions
 from mimic.arms.embodiment import Embodiment
 from mimic.retargeting.pose_baselines import Poses, kinematic_model, smallest_rotation
 

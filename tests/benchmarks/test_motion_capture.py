@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.peers.frame_matching import match_frames
-from benchmarks.peers.segment_alignment import landmarks, part_directions
+from benchmarks.peers.landmarks import landmarks, part_directions
 from mimic.arms.embodiment import panda
 
 
