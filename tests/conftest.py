@@ -43,6 +43,7 @@ def pytest_configure(config: pytest.Config) -> None:
     share_compilations()  # in the environment, for processes that tests start; here JAX is imported already
     jax.config.update("jax_compilation_cache_dir", str(CACHE))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_traceback_in_locations_limit", 0)
     if importlib.util.find_spec("beartype") is not None:
         from tests.helpers import typechecking  # here already: the hook itself imports no more than `tests`
 
