@@ -18,6 +18,7 @@ from mimic.base.config import check_choice
 from mimic.base.distribution import install_command
 from mimic.control.limits import JointLimits, joint_limits
 from mimic.metric.config import MetricConfig
+from mimic.retargeting.branch_search import BranchSearch
 from mimic.retargeting.hand_target import matched_hands, placement
 from mimic.retargeting.live_pose import FAR, NEAR, ArmRows, Goal, LivePose
 from mimic.retargeting.pose import wrap_angles
@@ -34,9 +35,6 @@ _APPROACH = 0.5  # of the velocity limits, on the way to another posture
 _AHEAD = 0.05  # s, the shortest of the trajectories of which a tick takes the beginning
 _BRAKING = 0.5  # of twice the acceleration: what a joint needs to stop before its limit
 _GRIPPER_TIME = 0.25  # s at least from closed to open
-_LANES, _ROUNDS = 12, 25  # postures of a search for another branch, and ticks that it takes
-_SEARCHES = 2  # before an approach: the branch that is chosen there stays
-_ROOM = 3e-8  # weight there of the mean squared distance from the middle of the joints' ranges, in half ranges
 _STUCK = 0.3  # s with a hand that is not reached, after which another branch is searched
 _LINE, _DETOUR = 16, 1.1  # points of a straight way to another branch; it may increase the hand's cost so much
 
@@ -138,8 +136,9 @@ class Teleoperator:
         self._steps = int(np.clip(np.ceil(self.period / _STEP_TIME), 1, _MAX_STEPS))
         self._smoothing = float(1 - np.exp(-self.period / _SPEED_TIME))
         self._reach = self.limits.velocity * self.period
-        self._random = np.random.default_rng(0)
         self._lower, self._upper = self.limits.position.T
+        ranges = self.limits.position, leader.joint_range
+        self._branches = BranchSearch(self._pose, self._rows[1], follower, *ranges)
         self.engagements = 0
         self.reset(np.clip(follower.home, self._lower, self._upper))
 
@@ -159,12 +158,13 @@ class Teleoperator:
 
     def engage(self) -> None:
         """Lets the next sample lead: with "relative" from here, with "exact" by an approach of limited speed."""
-        self.is_engaged, self._anchor, self._goal = True, None, None
+        self.is_engaged, self._anchor = True, None
+        self._goal: Any = None  # or a `Goal`
         self.engagements += 1
         self._posture = self._path = self._limiter.qpos
         self._speed, self._posture_rows, self._is_reached = np.zeros_like(self._path), None, True
         self._left = FAR
-        self._is_near, self._stuck, self._lanes, self._rounds = self._is_relative, 0.0, None, 0
+        self._is_near, self._stuck, self._searched, self._is_chosen = self._is_relative, 0.0, None, False
 
     def disengage(self) -> None:
         """Brakes the follower, which then stays where it is."""
@@ -254,7 +254,7 @@ class Teleoperator:
         kept = 1 - self._smoothing
         self._speed = kept * self._speed + self._smoothing / self.period * moved if is_free else 0 * moved
         self._search(goal)
-        if self._lanes is not None and not self._is_near:
+        if self._searched is not None and not self._is_near:
             return  # where an approach goes is not known yet
         if not (follows and self._is_near):
             moved = self._posture - self._path
@@ -263,36 +263,25 @@ class Teleoperator:
         self._path = self._posture if fraction <= 1 else self._path + moved / fraction
 
     def _search(self, goal: Goal) -> None:
-        """Searches other branches at the start of an approach, and while the hand is not reached, a step in a tick."""
-        if self._lanes is None:
+        """Searches other branches at the start of an approach, and while the hand is not reached, in each tick."""
+        if self._searched is None:
             is_well = self._is_reached or not self._is_near
             self._stuck = 0.0 if is_well else self._stuck + self.period
             if self._is_near and self._stuck < _STUCK:
                 return
-            if not self._is_near and self._rounds:
+            if not self._is_near and self._is_chosen:
                 return  # on its way
-            self._lanes, self._rounds = self._spread(self._posture), 0
-        box = np.maximum(self._lower, self._lanes - 0.5), np.minimum(self._upper, self._lanes + 0.5)
-        self._lanes = self._pose.step(goal, self._lanes, *box, FAR)
-        self._rounds += 1
-        if self._rounds % _ROUNDS:
+            now = self._posture, lambda: self._goal
+            ahead = lambda: self._samples.last, self._goal_of
+            self._searched = self._branches.search(*now) if self._is_near else self._branches.search_ahead(*now, *ahead)
+        found = None
+        for _ in range(self._steps):
+            found = found or next(self._searched)
+        if found is None:
             return
-        cost = self._pose.cost(goal, self._rows[1](self._lanes))
-        if not self._is_near:  # a wrist that is flipped is as near to the leader, but may soon be at a limit
-            low, high = self._lower, self._upper
-            cost = cost + _ROOM * np.mean(((2 * self._lanes - low - high) / (high - low)) ** 2, axis=1)
-        best = self._lanes[cost.argmin()]
-        if not self._is_near and self._rounds < _SEARCHES * _ROUNDS:
-            self._lanes = self._spread(best)
-            return
-        self._lanes, self._stuck = None, 0.0
-        if not self._is_near or self._leads_there(goal, best, float(cost.min())):
-            self._posture, self._posture_rows, self._is_near = best, None, False
-
-    def _spread(self, posture: np.ndarray) -> np.ndarray:
-        """Random postures [lanes, joints], of which the first is this one."""
-        low, high = np.maximum(self._lower, -np.pi), np.minimum(self._upper, np.pi)
-        return np.concatenate([posture[None], self._random.uniform(low, high, (_LANES - 1, len(low)))])
+        self._searched, self._stuck, self._is_chosen = None, 0.0, True
+        if not self._is_near or self._leads_there(goal, *found):
+            self._posture, self._posture_rows, self._is_near = found[0], None, False
 
     def _leads_there(self, goal: Goal, posture: np.ndarray, cost: float) -> bool:
         """Whether another branch is better, and the hand does not go away from its goal on the straight way there."""
@@ -353,7 +342,8 @@ class _Samples:
 
     def forget(self) -> None:
         """Takes the next sample wherever it is."""
-        self.reason, self.age, self.last, self._newest = "", 0.0, None, -np.inf
+        self.reason, self.age, self._newest = "", 0.0, -np.inf
+        self.last: Any = None
         self._jumped, self._agreeing, self._backwards = None, 0.0, 0.0
 
     def accept(self, qpos: Any, time: float | None) -> np.ndarray | None:

@@ -10,6 +10,7 @@ import mimic
 from mimic.retargeting.hand_target import matched_hands
 from mimic.retargeting.live_pose import FAR, ArmRows, LivePose
 from mimic.retargeting.teleoperation import follower_limits
+from tests.helpers import original_model
 
 RATE = 100.0
 READY = np.array([0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4])
@@ -204,3 +205,13 @@ def test_arguments_are_checked(arms):
         operator.reset([9.0] * 6)
     with pytest.raises(ValueError, match=r"leader_qpos: expected 7 angles"):
         operator.step([0.0] * 6)
+
+
+def test_flipped_wrists_keep_the_rotation_of_the_hand(arms, tmp_path):
+    (file := tmp_path / "ur.xml").write_text(original_model.ur_like())
+    arm = mimic.build_arm(mimic.ArmConfig(model=str(file)), "hardware").embodiment
+    search, rows = mimic.Teleoperator(arms[0], arm, velocity=3.0)._branches, ArmRows(arm)
+    flipped = search._flipped(np.array([0.3, -1.2, 1.4, -1.0, -1.2, 0.2]))
+    assert len(flipped) > 1 and np.all(np.abs(np.diff(flipped, axis=0)).max(axis=1) > 1)
+    axes = rows(flipped)[:, rows.hand_rows(np.array([0]))[1:]]
+    np.testing.assert_allclose(axes, np.tile(axes[:1], (len(axes), 1, 1)), atol=1e-9)
