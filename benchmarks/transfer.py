@@ -175,7 +175,8 @@ def round_trip(options: argparse.Namespace, expert: Model, name: str) -> Row:
 
 def teleoperation(options: argparse.Namespace) -> Iterator[Row]:
     """The recorded leader's episodes as a data set of the Piper, and what the recording's own mapping did."""
-    options.data, options.episodes, out = Path(options.data), None, Path(options.work) / "so101_to_piper"
+    options.data, options.robots, options.episodes = Path(options.data), Path(), None  # of benchmarks.teleoperation
+    out = Path(options.work) / "so101_to_piper"
     model = ET.parse(options.data / "arms/piper.urdf")
     for number, speed in enumerate(SPEED["piper"], start=1):
         limit = model.find(f"joint[@name='joint{number}']/limit")

@@ -97,10 +97,18 @@ def _lacking(path: Path, info: Mapping[str, Any], episodes: int, frames: int) ->
         stated = info.get(f"total_{what}", count)
         if stated != count:
             lines.append(f"warning: {INFO} states {stated} {what}, the data has {count}")
-    for name, form in info["features"].items():
-        if form.get("dtype") == "video" and not any((path / "videos").rglob(f"*{name.split('.')[-1]}*/**/*.mp4")):
-            lines.append(f"warning: the videos of {name} are missing, and so they are in what is written")
+    lines += [
+        f"warning: the videos of {name} are missing, and it is left out of what is written"
+        for name in missing_videos(path, info["features"])
+    ]
     return lines
+
+
+def missing_videos(path: Path, features: Mapping[str, Any]) -> list[str]:
+    """The features that are videos of which the dataset has no file."""
+    files = [file.relative_to(path).as_posix() for file in (path / "videos").rglob("*.mp4")]
+    names = [name for name, form in features.items() if form.get("dtype") == "video"]
+    return [name for name in names if not any(name in file or name.split(".")[-1] in file for file in files)]
 
 
 def _check_info(info: Mapping[str, Any]) -> float:

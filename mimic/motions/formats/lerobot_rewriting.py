@@ -9,7 +9,7 @@ import numpy as np
 
 from mimic.base.files import check_file, copy_file, read_json, read_text
 from mimic.motions.formats.lerobot import DATA_FOLDER, EPISODES_FOLDER, INFO, STATS, statistics
-from mimic.motions.formats.lerobot_reading import FINAL, feature_names, numbers
+from mimic.motions.formats.lerobot_reading import FINAL, feature_names, missing_videos, numbers
 from mimic.motions.formats.replacing import Column, Replacement, replaced_columns, replaced_values
 
 _LINES, _STATS_LINES = "meta/episodes.jsonl", "meta/episodes_stats.jsonl"  # of version 2: a line for each episode
@@ -63,6 +63,8 @@ def rewrite_lerobot(source: Path, out: Path, replacement: Replacement) -> list[s
     """
     info = read_json(source / INFO)
     plan = _Plan(info, replacement)
+    for name in missing_videos(source, plan.features):
+        del plan.features[name]  # LeRobot opens no dataset without them
     is_old = str(info["codebase_version"]).startswith("v2.")
     _write_data(source, out, plan, is_old)
     (_write_lines if is_old else _write_episodes)(source, out, plan)
