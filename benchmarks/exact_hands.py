@@ -4,20 +4,22 @@
     python -m benchmarks.exact_hands ur5e=FILE --throughput 65536     # poses/s of one batch, for a GPU
 
 NAME=FILE is an arm and its MJCF or URDF file, with @TIP after it for a file with several arms; NAME is one of SPEEDS.
-fr3= without a file is the Panda with other ranges. ssik and mink must be installed.
+fr3= without a file is the Panda with other ranges. ssik and mink must be installed; PyRoki is compared where it is.
 
 Random poses: within the Panda's joint ranges, with both bases at one place. `solved` is the fraction of the poses that
 ssik (closed form) solves which `imitate_pose` solves too; `unsolved_by_ssik` counts what it solves beyond. Hands are
 checked in double precision. Demonstrations: recordings of robosuite, with a base from `find_base`. ssik takes the
 solution nearest to the last one, and the first one to the home pose, from where mink tracks the hand in ten steps a
-frame. The elbow is compared in chain lengths in the axes of the expert's base, and the plane of shoulder, elbow and
-wrist by its normal.
+frame, and PyRoki by least squares from the last pose, with a small cost of leaving it. The elbow is compared in chain
+lengths in the axes of the expert's base, and the plane of shoulder, elbow and wrist by its normal.
 """
 
 import argparse
 import dataclasses
+import io
 import time
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -205,6 +207,54 @@ def followed_by_mink(arm: Embodiment, targets: np.ndarray, start: np.ndarray) ->
     return np.stack(path)
 
 
+def urdf(arm: Embodiment) -> str:
+    """URDF of an arm's joints and ranges, with a link `hand` whose axes are those of the base in the zero pose."""
+    text, origin, links = "", np.zeros(3), [f"link{joint}" for joint in range(arm.num_joints + 1)]
+    for joint, (axis, anchor, low, high) in enumerate(
+        zip(arm.joint_axis, arm.joint_anchor, *arm.joint_range.T, strict=True)
+    ):
+        text += f"""<joint name="j{joint}" type="revolute"><parent link="link{joint}"/><child link="link{joint + 1}"/>
+            <origin xyz="{_words(anchor - origin)}"/><axis xyz="{_words(axis)}"/>
+            <limit lower="{low}" upper="{high}" velocity="1" effort="1"/></joint>"""
+        origin = anchor
+    text += f"""<joint name="fixed" type="fixed"><parent link="{links[-1]}"/><child link="hand"/>
+        <origin xyz="{_words(arm.hand_position[0] - origin)}"/></joint>"""
+    return f'<robot name="arm">{"".join(f"""<link name="{link}"/>""" for link in (*links, "hand"))}{text}</robot>'
+
+
+def _words(numbers: np.ndarray) -> str:
+    return " ".join(map(repr, map(float, numbers)))
+
+
+def followed_by_pyroki(arm: Embodiment, targets: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """PyRoki's least squares from the last pose at each time, with the weights of its examples."""
+    import jaxlie
+    import jaxls
+    import pyroki
+    import yourdfpy
+
+    robot = pyroki.Robot.from_urdf(yourdfpy.URDF.load(io.StringIO(urdf(arm))))
+    link, joints = jax.numpy.array(robot.links.names.index("hand")), robot.joint_var_cls(0)
+
+    @jax.jit
+    def solve(target: jax.Array, last: jax.Array) -> jax.Array:
+        costs = [
+            pyroki.costs.pose_cost_analytic_jac(
+                robot, joints, jaxlie.SE3.from_matrix(target), link, pos_weight=50.0, ori_weight=10.0
+            ),
+            pyroki.costs.limit_cost(robot, joints, weight=100.0),
+            pyroki.costs.rest_cost(joints, last, weight=1e-3),
+        ]
+        problem = jaxls.LeastSquaresProblem(costs, [joints]).analyze()
+        initial = jaxls.VarValues.make([joints.with_value(last)])
+        return problem.solve(initial, verbose=False, linear_solver="dense_cholesky")[joints]
+
+    path = [jax.numpy.asarray(start, np.float32)]
+    for target in targets @ homogeneous(arm.hand_rotation[0].T, np.zeros(3)):
+        path.append(solve(jax.numpy.asarray(target, np.float32), path[-1]))
+    return np.stack(path[1:]).astype(float)
+
+
 def shoulder_elbow_wrist(arm: Embodiment, qpos: np.ndarray) -> np.ndarray:
     """Anchors [3, time, 3] of joints 2, 4 and 6 in the base frame, of arms with six joints of 2, 3 and 5."""
     chosen = (1, 3, 5) if arm.num_joints == 7 else (1, 2, 4)
@@ -215,8 +265,8 @@ def shoulder_elbow_wrist(arm: Embodiment, qpos: np.ndarray) -> np.ndarray:
     return np.stack(points)
 
 
-def posture(expert: Embodiment, learner: Embodiment, base: np.ndarray, qpos: np.ndarray, own: np.ndarray) -> Row:
-    """How far the elbow and the plane of shoulder, elbow and wrist are from the expert's."""
+def posture(expert: Embodiment, learner: Embodiment, base: Any, qpos: np.ndarray, own: np.ndarray) -> Row:
+    """How far elbow, wrist and the plane of shoulder, elbow and wrist are from the expert's at each time."""
     points = [
         shoulder_elbow_wrist(expert, qpos) / float(expert.chain_length),
         shoulder_elbow_wrist(learner, own) @ placement(base).rotation.T / float(learner.chain_length),
@@ -224,10 +274,8 @@ def posture(expert: Embodiment, learner: Embodiment, base: np.ndarray, qpos: np.
     normals = [np.cross(p[1] - p[0], p[2] - p[0]) for p in points]
     normals = [n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-9) for n in normals]
     cosine = np.abs(np.sum(normals[0] * normals[1], axis=-1))  # a plane has two normals
-    return {
-        "elbow": np.linalg.norm(points[0][1] - points[1][1], axis=-1).mean(),
-        "plane_deg": np.degrees(np.arccos(np.minimum(cosine, 1))).mean(),
-    }
+    _, elbow, wrist = np.linalg.norm(points[0] - points[1], axis=-1)
+    return {"elbow": elbow, "wrist": wrist, "plane_deg": np.degrees(np.arccos(np.minimum(cosine, 1)))}
 
 
 def demonstrations(folder: Path, tasks: tuple[str, ...]) -> Iterator[tuple[str, np.ndarray, float]]:
@@ -260,6 +308,8 @@ def motion_rows(
         "ssik, seeded": lambda: followed_by_ssik(learner, targets, home),
         "mink": lambda: followed_by_mink(learner, targets, home),
     }
+    if find_spec("pyroki"):
+        methods["PyRoki"] = lambda: followed_by_pyroki(learner, targets, home)
     for method, solve in methods.items():
         began = time.perf_counter()
         own = np.asarray(solve(), float)
@@ -280,7 +330,7 @@ def motion_rows(
                 "rotation_deg": np.degrees(rotation.max()),
                 "fastest": fastest.max(),
                 "fps": len(qpos) / seconds,
-                **posture(expert, learner, base, qpos.astype(float), own),
+                **{key: x.mean() for key, x in posture(expert, learner, base, qpos.astype(float), own).items()},
             }
         )
 

@@ -4,8 +4,9 @@
 
 The learner takes the pose of minimum distance under each candidate metric (links kept or merged, correspondence,
 translation weight; the rotation weight is 1); with --hands under the default metric with each weight of the hand's
-rotation. Baselines are those of `mimic.retargeting.pose_baselines`. FOLDER holds
-an unpacked wheel of robosuite, for arms other than the Panda. Each pair, links and correspondence compiles for 10 s.
+rotation, where elbow, wrist and the plane of shoulder, elbow and wrist are compared too. Baselines are those of
+`mimic.retargeting.pose_baselines`. FOLDER holds an unpacked wheel of robosuite, for arms other than the Panda. Each
+pair, links and correspondence compiles for 10 s.
 """
 
 import dataclasses
@@ -22,6 +23,7 @@ import numpy as np
 import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, write_results
+from benchmarks.exact_hands import posture
 from benchmarks.figures import similarity_front
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.envs.config import EnvConfig
@@ -104,6 +106,13 @@ def with_hands(pair: EnvConfig, qpos: np.ndarray) -> Iterator[tuple[str, mimic.E
         yield f"hand {weight:g}", learner, np.asarray(solve(jnp.asarray(qpos, jnp.float32), jnp.float32(weight)))
 
 
+def with_locked(whole: mimic.Embodiment, arm: mimic.Embodiment, qpos: np.ndarray) -> np.ndarray:
+    """Poses of an arm with its locked joints, which are at 0."""
+    poses = np.zeros((len(qpos), whole.num_joints))
+    poses[:, [whole.joint_names.index(name) for name in arm.joint_names]] = qpos
+    return poses
+
+
 def run_pair(pair: EnvConfig, demonstrations: int, random: int, *, hands: bool = False) -> list[Row]:
     expert, learner = pair.build_arms().embodiments
     count, every = (max(FULL_DEMONSTRATIONS, demonstrations), 5) if pair.name == FULL else (demonstrations, EVERY)
@@ -113,9 +122,12 @@ def run_pair(pair: EnvConfig, demonstrations: int, random: int, *, hands: bool =
         rows.append({"pair": pair.name, "set": kind, "failed": motions.pop(kind)})
     sets = {kind: motion[:, ::every].reshape(-1, expert.num_joints) for kind, motion in motions.items()}
     lines = {kind: centre_line_table(expert, qpos) for kind, qpos in sets.items()}
+    whole = build_arm(dataclasses.replace(pair.learner, locked=[])).embodiment
 
     def add(method: str, kind: str, arm: mimic.Embodiment, qpos: np.ndarray) -> None:
         values = similarity(lines[kind], centre_line_table(arm, qpos))
+        if hands:
+            values |= posture(expert, whole, None, sets[kind], with_locked(whole, arm, qpos))
         means = {name: [round(float(x), 5) for x in (v.mean(), np.quantile(v, 0.9))] for name, v in values.items()}
         rows.append({"pair": pair.name, "set": kind, "poses": len(qpos), "method": method, "measures": means})
 

@@ -14,20 +14,27 @@ from mimic.retargeting.pose_baselines import BASELINES
 FRONT = ("centre_line_distance", "tangent_angle_deg", "hand_position_error", "hand_angle_deg")  # a candidate's aims
 SLACK = {"hand_position_error": 1.05}  # multiple of the baseline's value that is no loss; 1 for the others
 # Below these a baseline is exact (a locked last roll joint moves no link): no ratio, and reaching them is no loss.
-EXACT = {name: 0.1 if name.endswith("deg") else 1e-3 for name in MEASURES}
+POSTURE = "elbow", "wrist", "plane_deg"  # of `benchmarks.exact_hands.posture`, in the rows of weights of the hand
+EXACT = {name: 0.1 if name.endswith("deg") else 1e-3 for name in (*MEASURES, *POSTURE)}
 NO_HAND = "hand 0"  # the default metric without a weight of the hand
 DEMONSTRATIONS = "computed_torque", "reach"
 
 
 def to_lines(rows: Sequence[Row]) -> list[str]:
     """Rows as lines of a table, a quarter of the size of JSON; a set that failed has the reason as its method."""
-    columns = [f"{name}{suffix}" for name in MEASURES for suffix in ("", " q90")]
+    names = measure_names(rows)
+    columns = [f"{name}{suffix}" for name in names for suffix in ("", " q90")]
     lines = [";".join(["pair", "set", "poses", "method", *columns])]
     for row in rows:
-        values = [f"{value:g}" for name in MEASURES for value in row.get("measures", {}).get(name, ())]
+        values = [f"{value:g}" for name in names for value in row.get("measures", {}).get(name, ())]
         words = [row["pair"], row["set"], str(row.get("poses", 0)), row.get("failed", row.get("method"))]
         lines.append(";".join([*words, *values]))
     return lines
+
+
+def measure_names(rows: Sequence[Row]) -> list[str]:
+    """Names of the measures of some rows."""
+    return list(next((row["measures"] for row in rows if "measures" in row), {}))
 
 
 def is_lock(row: Row) -> bool:
@@ -59,7 +66,7 @@ def compare(rows: Sequence[Row], baseline: str, sets: Sequence[str]) -> dict[str
     for method in dict.fromkeys(row["method"] for row in chosen):
         if all({method, baseline} <= set(case) for case in cases.values()):
             result[method] = {"cases": len(cases)}
-            for name in MEASURES:
+            for name in measure_names(chosen):
                 values = [(case[method][name], case[baseline][name]) for case in cases.values()]
                 ratios = [np.log(max(own, EXACT[name]) / other) for own, other in values if other > EXACT[name]]
                 lost = sum(own > max(SLACK.get(name, 1.0) * other, EXACT[name]) for own, other in values)
@@ -80,7 +87,8 @@ def pareto_front(compared: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def print_tables(rows: Sequence[Row]) -> None:
-    columns = " ".join(["method", *(f"{name}[{entry}]" for name in MEASURES for entry in ("ratio", "lost")), "front"])
+    names = measure_names(rows)
+    columns = " ".join(["method", *(f"{name}[{entry}]" for name in names for entry in ("ratio", "lost")), "front"])
     for title, compared in summarise(rows).items():
         front = pareto_front(compared)
         table = [{"method": key, **result, "front": "*" * (key in front)} for key, result in compared.items()]
