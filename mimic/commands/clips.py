@@ -158,7 +158,7 @@ def _static_clip(env: EnvConfig, title: str, time: np.ndarray, qpos: np.ndarray,
         states = link_states(expert, qpos), link_states(learner, learner_qpos)
         distances = metric.link_distances(*states)
         by_link = (metric.matrix(distances) * distances).sum(axis=0) / distances.size
-        return metric.reduced(distances), by_link
+        return metric(*states), by_link  # with the hand, which is no link
 
     evaluate_batch = jax.jit(jax.vmap(evaluate))
     distance, by_link = map(np.asarray, evaluate_batch(qpos, learner_qpos))

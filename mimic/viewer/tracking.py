@@ -168,7 +168,7 @@ def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None 
         lines = centre_line(expert, qpos), centre_line(learner, learner_qpos)
         weighted = metric(weights)
         links = weighted.link_distances(*states)
-        return PoseComparison(weighted.reduced(links), weighted.matrix(links), links, similarity(*lines))
+        return PoseComparison(weighted(*states), weighted.matrix(links), links, similarity(*lines))
 
     def best(qpos: Array, weights: Array) -> tuple[Array, Array]:
         solution = imitate_pose(expert, learner, qpos, **metric(weights).arguments)

@@ -97,12 +97,15 @@ def test_what_is_shown_is_the_metric(live, env):
         for arm, angles in ((expert, frame.expert), (learner, frame.learner))
     )
     matrix = mimic.arc_length_correspondence(expert, learner)
-    distance = mimic.embodiment_distance(
-        expert_states, learner_states, matrix, mimic.DistanceWeights(translation=1.0, rotation=1.0)
+    of_links, distance = (
+        mimic.embodiment_distance(
+            expert_states, learner_states, matrix, mimic.DistanceWeights(1.0, 1.0), hand_weights=mimic.HandWeights(hand)
+        )
+        for hand in (0.0, 0.02)
     )
     np.testing.assert_allclose(frame.distance, distance, atol=1e-5)  # float32 of two functions
     np.testing.assert_allclose(frame.matrix, matrix, atol=1e-6)
-    np.testing.assert_allclose((frame.matrix * frame.links).mean(), distance, atol=1e-5)
+    np.testing.assert_allclose((frame.matrix * frame.links).mean(), of_links, atol=1e-5)
     assert frame.expert_links == expert.link_names and frame.learner_links == learner.link_names
 
 
