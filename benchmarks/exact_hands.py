@@ -9,7 +9,7 @@ fr3= without a file is the Panda with other ranges. ssik and mink must be instal
 Random poses: within the Panda's joint ranges, with both bases at one place. `solved` is the fraction of the poses that
 ssik (closed form) solves which `imitate_pose` solves too; `unsolved_by_ssik` counts what it solves beyond. Hands are
 checked in double precision. Demonstrations: recordings of robosuite, with a base from `find_base`. ssik takes the
-solution nearest to the last one, and the first one to the home pose, from where mink tracks the hand in ten steps a
+solution nearest to the last one, and the first one to the home pose. From there mink tracks the hand in ten steps a
 frame, and PyRoki by least squares from the last pose, with a small cost of leaving it. The elbow is compared in chain
 lengths in the axes of the expert's base, and the plane of shoulder, elbow and wrist by its normal.
 """
@@ -303,13 +303,14 @@ def motion_rows(
         )
 
     home = np.asarray(learner.home, float)
+    start = followed_by_ssik(learner, targets[:1], home)[0]
     methods: dict[str, Callable[[], np.ndarray]] = {
         "mimic": lambda: imitate().qpos,
         "ssik, seeded": lambda: followed_by_ssik(learner, targets, home),
-        "mink": lambda: followed_by_mink(learner, targets, home),
+        "mink": lambda: followed_by_mink(learner, targets, start),
     }
     if find_spec("pyroki"):
-        methods["PyRoki"] = lambda: followed_by_pyroki(learner, targets, home)
+        methods["PyRoki"] = lambda: followed_by_pyroki(learner, targets, start)
     for method, solve in methods.items():
         began = time.perf_counter()
         own = np.asarray(solve(), float)

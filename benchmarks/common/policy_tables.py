@@ -17,6 +17,8 @@ from benchmarks.common.cells import (
     where,
 )
 
+HAND_ROTATION = "hand_rotation_deg"
+
 # Poses
 
 
@@ -153,18 +155,15 @@ def overview(motions: Results, pose: Results) -> list[Cells]:
     return [*rows, ("poses at their optimum per second", rates["panda 7->7"], rates["panda 7->4"], "")]
 
 
-def main_results(
-    study: Results, preset: Results, pose: Results, mapper: Results, any_arm: Results, loops: Results
-) -> list[Cells]:
-    def held_out(reports: Sequence[Results]) -> str:
-        return f"{100 * mean(reports, 'held_out'):.2f}"
+def main_results(training: Results, pose: Results, mapper: Results, any_arm: Results, loops: Results) -> list[Cells]:
+    def measure(name: str, measure: str) -> float:
+        runs = where(training["rows"], env="panda4dof")
+        return statistics.fmean(run["similarity"][name][measure]["held_out"] for run in runs)
 
-    def centre_line(name: str) -> str:
-        runs = preset_runs(preset, "panda4dof")
-        return f"{statistics.fmean(run['similarity'][name][MEASURES[0]]['held_out'] for run in runs):.3f}"
-
-    ppo = ", ".join(held_out(preset_runs(preset, env)) for env in ENVIRONMENTS)
-    searched = ", ".join(held_out(study["results"][f"{env}--searched"]) for env in ENVIRONMENTS)
+    ppo = ", ".join(
+        span([run["optimality_gap"]["held_out"] for run in where(training["rows"], env=env)]) for env in ENVIRONMENTS
+    )
+    lines, hands = ([measure(name, key) for name in ("policy", "copy_joints")] for key in (MEASURES[0], HAND_ROTATION))
     newton = one(pose["results"], pair="panda 7->4")["methods"]["newton"]
     network = next(run for run in mapper["runs"] if run["report"]["env"] == "panda4dof")
     quality = percent(network["report"]["quality"]["held_out"], ".1f")
@@ -177,12 +176,12 @@ def main_results(
         ("result", "page"),
         (
             f"PPO has held-out gaps of {ppo} % with 7, 4, 3 joints; 0 is the kinematic bound, 100 % holding the start "
-            f"pose. Searched torques reach {searched} %.",
-            "[dynamic motions](dynamic_imitation.md#the-three-simulations)",
+            "pose.",
+            "[dynamic motions](dynamic_imitation.md#motions-of-several-kinds)",
         ),
         (
-            f"Its centre line is {centre_line('policy')} chain lengths from the expert's with 4 joints; copying shared "
-            f"joints has {centre_line('copy_joints')}.",
+            f"Its centre line is {lines[0]:.3f} chain lengths from the expert's with 4 joints, its hand {hands[0]:.0f} "
+            f"deg; copying shared joints has {lines[1]:.3f} and {hands[1]:.0f} deg.",
             "[similarity](dynamic_imitation.md#similarity)",
         ),
         (
@@ -204,19 +203,19 @@ def main_results(
     ]
 
 
-def policy_similarity(preset: Results) -> list[Cells]:
-    forms = (".3f", ".1f", ".3f", ".3f", ".1f")
+def policy_similarity(training: Results) -> list[Cells]:
+    forms = (".3f", ".1f", ".3f", ".3f", ".1f", ".1f")
     names = {
         "policy": "**policy**",
         "nearest_poses": "nearest poses",
         "copy_joints": "copying shared joints",
         "hand_ik": "IK of the scaled hand",
     }
-    runs = preset_runs(preset, "panda4dof")
-    rows: list[Cells] = [("7 to 4", *SIMILARITY_HEADER)]
+    runs = where(training["rows"], env="panda4dof")
+    rows: list[Cells] = [("7 to 4", *SIMILARITY_HEADER, "hand rotation")]
     for name, label in names.items():
         cells = [label]
-        for measure, form in zip(MEASURES, forms, strict=True):
+        for measure, form in zip((*MEASURES, HAND_ROTATION), forms, strict=True):
             values = [run["similarity"][name][measure] for run in runs]
             means = {split: statistics.fmean(value[split] for value in values) for split in ("train", "held_out")}
             cells.append(split_pair(means, form, 1))
@@ -242,6 +241,21 @@ def pretrained(reports: Results) -> list[Cells]:
             distances = [report[key]["held_out"] for key in ("mean_distance", best, "copying_distance")]
             cells += [f"{gap} %", " / ".join(f"{distance:.3f}" for distance in distances)]
         rows.append(cells)
+    return rows
+
+
+def exact_hands(results: Results) -> list[Cells]:
+    """Means over all frames of each arm's demonstrations; the speed is the maximum."""
+    rows: list[Cells] = [("arm", "method", "exact", "speed", "elbow", "plane [deg]")]
+    names = {"ur5e": "UR5e", "fr3": "FR3"}
+    for arm, method in dict.fromkeys((row["learner"], row["method"]) for row in results["motions"]):
+        motions = where(results["motions"], learner=arm, method=method)
+        frames = sum(row["frames"] for row in motions)
+        exact, elbow, plane = (
+            sum(row[key] * row["frames"] for row in motions) / frames for key in ("exact", "elbow", "plane_deg")
+        )
+        fastest = max(row["fastest"] for row in motions)
+        rows.append((names[arm], method, percent(exact, ".1f"), f"{fastest:.1f}", f"{elbow:.3f}", f"{plane:.1f}"))
     return rows
 
 
@@ -286,14 +300,25 @@ def hand_weights(results: Results) -> list[Cells]:
     return rows
 
 
+def hand_postures(results: Results) -> list[Cells]:
+    groups = {"locks": "locked", "other arms": "other arms"}
+    summaries = [results["summary"][f"{group}, demonstrations, to no weight"] for group in groups]
+    measures = {"elbow": "elbow", "wrist": "wrist", "plane_deg": "plane"}
+    rows: list[Cells] = [("weight", *(f"{arms}: {name}" for arms in groups.values() for name in measures.values()))]
+    for method in ("hand 0.01", "hand 0.02", "hand 0.05", "hand 0.1"):
+        ratios = [f"{summary[method][measure]['ratio']:.2f}" for summary in summaries for measure in measures]
+        rows.append((method.removeprefix("hand "), *ratios))
+    return rows
+
+
 def default_metric(results: Results) -> list[Cells]:
     cases = {
         "locks, demonstrations, to copy_joints": ("Panda with one or two joints locked", "copying joints"),
         "other arms, demonstrations, to hand_ik": ("the Panda and six other arms, both ways", "IK of the hand"),
     }
-    rows: list[Cells] = [("learner", "compared with", *SIMILARITY_HEADER)]
+    rows: list[Cells] = [("learner", "compared with", *SIMILARITY_HEADER, "hand rotation")]
     for case, (learner, baseline) in cases.items():
-        entry = results["summary"][case]["kept arc_length 1"]
-        ratios = [f"{entry[measure]['ratio']:.2f}" for measure in MEASURES]
+        entry = results["summary"][case]["hand 0.02"]
+        ratios = [f"{entry[measure]['ratio']:.2f}" for measure in (*MEASURES, HAND_ROTATION)]
         rows.append((f"{learner}, {entry['cases']} cases", baseline, *ratios))
     return rows

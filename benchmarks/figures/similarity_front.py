@@ -125,7 +125,7 @@ def plot_hands(rows: Sequence[Row], path: Path) -> None:
     """Rotation of the hand against the centre line for each weight, relative to none: the price of the hand."""
     figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
     groups = {
-        "28 locked Pandas": [*filter(is_lock, rows)],
+        "Panda with one or two joints locked": [*filter(is_lock, rows)],
         "Panda and other arms": [r for r in rows if " to " in r["pair"]],
     }
     for label, group in groups.items():
