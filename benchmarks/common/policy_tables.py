@@ -305,7 +305,7 @@ def hand_postures(results: Results) -> list[Cells]:
     summaries = [results["summary"][f"{group}, demonstrations, to no weight"] for group in groups]
     measures = {"elbow": "elbow", "wrist": "wrist", "plane_deg": "plane"}
     rows: list[Cells] = [("weight", *(f"{arms}: {name}" for arms in groups.values() for name in measures.values()))]
-    for method in ("hand 0.01", "hand 0.02", "hand 0.05", "hand 0.1"):
+    for method in ("hand 0.01", "hand 0.02", "hand 0.05"):
         ratios = [f"{summary[method][measure]['ratio']:.2f}" for summary in summaries for measure in measures]
         rows.append((method.removeprefix("hand "), *ratios))
     return rows
