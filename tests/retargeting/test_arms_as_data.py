@@ -15,7 +15,7 @@ from mimic.retargeting.costs import Costs
 from tests.helpers.compilations import count_compilations
 
 EXPERT = ArmConfig()
-LOCKS = [(2, 3, 4, 5, 6), (1, 2, 4, 6, 7), (1, 3, 5, 6, 7)]  # learners of two joints, with other links on each of them
+LOCKS = [(2, 3, 4, 5, 6), (1, 2, 4, 6, 7)]  # learners of two joints, with other links on each of them
 WEIGHTS = DistanceWeights(1.0, 1.0, 0.001, 0.01)
 FEW = {"starts": 3, "iterations": 8}
 
