@@ -14,6 +14,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.retargeting.live_pose import FAR, ArmRows, Goal, LivePose
 
 _LANES, _STEPS = 12, 25  # random postures, and steps of each
+_LANES_ON_THE_WAY = 4  # while the follower follows, where a tick must not take long
 _STRIDE = 0.5  # rad, the longest step of a joint
 _ALIKE, _AS_GOOD = 0.3, 2e-6  # rad: postures of one branch; cost above the least of branches that are compared
 _MAX_BRANCHES = 4
@@ -52,7 +53,7 @@ class BranchSearch:
           posture: that is one of them [rad].
           goal: gives the goal of the next step.
         """
-        lanes = yield from self._settled(self._spread(posture), goal)
+        lanes = yield from self._settled(self._spread(posture, _LANES_ON_THE_WAY), goal)
         costs = self._pose.cost(goal(), self._follower(lanes))
         yield lanes[costs.argmin()], float(costs.min())
 
@@ -90,10 +91,10 @@ class BranchSearch:
         best = losses.argmin()
         yield lanes[best], float(costs[best])
 
-    def _spread(self, posture: np.ndarray) -> np.ndarray:
+    def _spread(self, posture: np.ndarray, lanes: int = _LANES) -> np.ndarray:
         """Random postures [lanes, joints], of which the first is this one."""
         low, high = np.clip(self._range, -np.pi, np.pi).T
-        return np.concatenate([posture[None], self._random.uniform(low, high, (_LANES - 1, len(low)))])
+        return np.concatenate([posture[None], self._random.uniform(low, high, (lanes - 1, len(low)))])
 
     def _flipped(self, posture: np.ndarray) -> np.ndarray:
         """This posture and those with one wrist flipped, which leaves the hand's rotation [1 + wrists, joints]."""
