@@ -101,7 +101,8 @@ def test_a_data_set_of_one_arm_becomes_one_of_another(tmp_path):
 def test_an_episode_of_which_few_frames_fail_is_searched_again(monkeypatch, failing, chosen):
     def of_seed(_, name, setting):
         causes = ("hand out of reach",) * failing[setting.seed] + ("",) * (100 - failing[setting.seed])
-        return setting.seed, Certificate(*[np.zeros(100)] * 5, causes)
+        none = np.zeros(100)
+        return setting.seed, Certificate(none, none, none, none, none, causes)
 
     monkeypatch.setattr(retarget_data, "_retarget_from", of_seed)
     setting = retarget_data._Setting(*[None] * 6, 0, *[None] * 4)  # type: ignore[arg-type]
