@@ -27,6 +27,7 @@ from benchmarks.common.record import Row, collect
 from mimic.arms.arm import Arm
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import to_dict
+from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import recorded_demonstrations, test_demonstrations
 from mimic.evaluation.rollout_metrics import gap_interval, gaps
 from mimic.motions.demonstrations import Demonstrations, load_demonstrations
@@ -116,7 +117,7 @@ def motions(name: str, config: TrainConfig, count: int, person: Path | None) -> 
     """The sets of motions, each with where the learner starts them."""
     env, expert = config.env, config.env.build_arms().expert
     if name == "test":
-        yield "home", test_demonstrations(env).select(slice(0, count * len(KINDS)))
+        yield "home", test_motions(env, count)
     elif name == "long":
         for kind in ("splines", "steps"):
             yield (
@@ -181,18 +182,28 @@ def _key(config: TrainConfig) -> str:
     return json.dumps(to_dict(dataclasses.replace(config, seed=0, run_dir="")), sort_keys=True, default=str)
 
 
+def policies_of(runs: list[Path]) -> list[list[tuple[Path, TrainConfig]]]:
+    """Runs and configs of each policy: runs that differ in nothing but their seed are one."""
+    groups: dict[str, list[tuple[Path, TrainConfig]]] = {}
+    for run in runs:
+        config = load_config(run)
+        groups.setdefault(_key(config), []).append((run, config))
+    return list(groups.values())
+
+
+def test_motions(env: EnvConfig, count: int) -> Demonstrations:
+    """The first motions of each kind of the test set."""
+    return test_demonstrations(env).select(slice(0, count * len(KINDS)))
+
+
 def main() -> None:
     parser = make_parser("motions", __doc__, sets=SETS, controllers=CONTROLLERS, count=640, person=Path)
     parser.add_argument("--runs", nargs="+", type=Path, required=True, metavar="RUN")
     options = parser.parse_args()
     use_compilation_cache("~/.cache/mimic/jax")
-    groups: dict[str, list[tuple[Path, TrainConfig]]] = {}
-    for run in options.runs:
-        config = load_config(run)
-        groups.setdefault(_key(config), []).append((run, config))
 
     def measured() -> Iterator[Row]:
-        for policies in groups.values():
+        for policies in policies_of(options.runs):
             for name in options.sets:
                 for start, unseen in motions(name, policies[0][1], options.count, options.person):
                     yield from rows(name, start, unseen, policies, options.controllers)

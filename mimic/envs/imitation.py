@@ -288,6 +288,15 @@ class ImitationEnv(Env):
         del before
         return action * self.torque_scale
 
+    def privileged(self, state: ArmState) -> Float[Array, " numbers"]:
+        """What only a critic observes: the elapsed fraction of the episode."""
+        return state.step[None] / self.config.horizon
+
+    @property
+    def privileged_size(self) -> int:
+        """Length of `privileged`."""
+        return jax.eval_shape(lambda: self.privileged(self.start(jax.random.PRNGKey(0)))).size
+
     def restart_done(self, states: State) -> State:
         """Starts a new episode, on a random demonstration, for each arm of a batch whose episode is done."""
         arms = arm_state(states)

@@ -22,7 +22,7 @@ from mimic.motions.demonstrations import Demonstrations
 from mimic.physics.inner_loop import LoopState, make_inner_loop
 from mimic.physics.mjx_loop import MjxLoop, make_mjx_loop
 from mimic.physics.mujoco_world import mujoco_world
-from mimic.physics.plant import Draw, Plant, draw_episode, make_plant
+from mimic.physics.plant import Draw, Plant, draw_episode, drawn_fractions, make_plant
 from mimic.physics.step import PhysicsChoice
 from mimic.physics.world import MAX_DELAY, WorldConfig
 
@@ -34,7 +34,8 @@ class HardwareEnv(ImitationEnv):
     """An `ImitationEnv` whose actions are targets of an inner loop, in a world with gravity, friction and delays.
 
     Reward and metrics are those of the true motion. The observation has the measured link states of the learner in
-    place of the true ones, and then the angles and velocities of the reference and the last actions that were sent.
+    place of the true ones, and then the angles and velocities of the reference, or the measured ones where actions are
+    torques, and the last actions that were sent. With `world.history`, the measured motion of past ticks follows.
 
     Args:
       config: see `EnvConfig`; of the kind "inner_loop".
@@ -112,14 +113,15 @@ class HardwareEnv(ImitationEnv):
         draw = draw_episode(self.world, self.config.randomization, joints, jax.random.fold_in(key, _DRAW))
         zero = jnp.zeros_like(qpos)
         actions = jnp.zeros((MAX_DELAY + 1, self.action_size))
+        sent = jnp.zeros((max(SENT_ACTIONS, self.world.history), self.action_size))
         reference = Reference(qpos + draw.bias, zero, zero)  # where the arm seems to be
         fields = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
         fields |= {"qpos": qpos, "load": None, "reference": reference, "torque": zero, "draw": draw}
         measured = self._measure(LoopState(qpos, zero, reference, zero), draw, state.key, state.step)
-        history = jnp.tile(measured, (MAX_DELAY + 1, 1))
+        history = jnp.tile(measured, (MAX_DELAY + 1 + self.world.history, 1))
         is_angle = self.config.control in ("joint_position", "joint_impedance")
         target = Target(reference.qpos if is_angle else zero, jnp.ones_like(qpos))  # the arm stays where it is
-        return HardwareState(**fields, sent=actions[:SENT_ACTIONS], arrived=actions, target=target, measured=history)
+        return HardwareState(**fields, sent=sent, arrived=actions, target=target, measured=history)
 
     def _simulate(
         self, before: ArmState, command: Float[Array, " numbers"]
@@ -135,10 +137,7 @@ class HardwareEnv(ImitationEnv):
         history = _pushed(state.arrived, arrived)
         acting = history[state.draw.action_delay]
         loop = LoopState(state.qpos, state.qvel, state.reference, state.torque)
-        if self._waiting_loop is not None:
-            loop = self._waiting_loop(state.draw, loop, state.target)
-        target = joint_control.action_target(self.config.control, acting, loop.reference, self.parameters, jnp)
-        loop = self._acting_loop(state.draw, loop, target)
+        loop, target = self.tick(state.draw, loop, state.target, acting)
         after = dataclasses.replace(
             state,
             qpos=loop.qpos,
@@ -153,13 +152,37 @@ class HardwareEnv(ImitationEnv):
         )
         return after, loop.torque
 
+    def tick(
+        self, draw: Draw, loop: LoopState, before: Target, acting: Float[Array, " numbers"]
+    ) -> tuple[LoopState, Target]:
+        """Arm and inner loop after a tick, and the target at its end.
+
+        Args:
+          draw: what is drawn for an episode; its delays have no effect here.
+          loop: arm and inner loop before the tick.
+          before: target at the end of the last tick.
+          acting: the action that acts in this tick.
+        """
+        if self._waiting_loop is not None:
+            loop = self._waiting_loop(draw, loop, before)
+        target = joint_control.action_target(self.config.control, acting, loop.reference, self.parameters, jnp)
+        return self._acting_loop(draw, loop, target), target
+
     def _measure(self, state: LoopState, draw: Draw, key: Array, step: Array) -> Float[Array, " numbers"]:
         """Measured angles and velocities, and those of the reference."""
         world, reference = self.world, state.reference
+        is_torque = self.config.control == "torque"
         key = jax.random.fold_in(jax.random.fold_in(key, _MEASURE), step)
         noise = jax.random.normal(key, (2, len(state.qpos)))
         qpos = state.qpos + draw.bias + world.position_noise * noise[0]
-        return jnp.concatenate([qpos, state.qvel + world.velocity_noise * noise[1], reference.qpos, reference.qvel])
+        qvel = state.qvel + world.velocity_noise * noise[1]
+        return jnp.concatenate([qpos, qvel, *((qpos, qvel) if is_torque else (reference.qpos, reference.qvel))])
+
+    def privileged(self, state: ArmState) -> Float[Array, " numbers"]:
+        """What only a critic observes: the elapsed fraction of the episode, and what was drawn for it."""
+        draw = cast(HardwareState, state).draw
+        fractions = drawn_fractions(draw, self.world, self.config.randomization)
+        return jnp.concatenate([super().privileged(state), fractions])
 
     def commanded_torque(
         self, before: ArmState, after: ArmState, action: Float[Array, " numbers"]
@@ -182,7 +205,13 @@ class HardwareEnv(ImitationEnv):
         state = cast(HardwareState, state)
         measured = state.measured[state.draw.observation_delay]
         expert = [self.expert_at(state.demonstration, state.step + k) for k in range(self.config.preview + 1)]
-        return control_observation(self, measured, state.sent.ravel(), expert_vector(expert))
+        observation = control_observation(self, measured, state.sent.ravel(), expert_vector(expert))
+        if not self.world.history:
+            return observation
+        past = jax.lax.dynamic_slice_in_dim(state.measured, state.draw.observation_delay + 1, self.world.history)
+        qpos, qvel, *_ = jnp.split(past, 4, axis=1)
+        displacement = qpos - measured[: len(state.qpos)]  # of the order of its deviation, in contrast to the angles
+        return jnp.concatenate([observation, displacement.ravel(), qvel.ravel()])
 
 
 def plant_of(config: EnvConfig, arm: Arm) -> Plant:

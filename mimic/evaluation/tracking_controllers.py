@@ -75,7 +75,7 @@ def run_controller(evaluator: Evaluator, name: str) -> tuple[Rollouts, dict[str,
         return jax.jit(lambda: evaluator.rollout(one_step))(), {"frequency_rad_s": 0.0}
     motions = copied_motions(env) if name == "copy_joints" else reference_motions(env)
     make_controller = _feedback(env, (_joint_law if name == "pd" else _inverse_dynamics_law)(env), motions)
-    rollouts, frequency = _best(evaluator, make_controller, _FREQUENCIES)
+    rollouts, frequency = best_setting(evaluator, make_controller, _FREQUENCIES)
     return rollouts, {"frequency_rad_s": frequency}
 
 
@@ -83,7 +83,7 @@ def run_tracking(evaluator: Evaluator, *, is_delayed: bool = False) -> tuple[Rol
     """Rollouts of `tracking_controller` with the best of several leads, and this lead [ticks]."""
     env, poses = cast(HardwareEnv, evaluator.env), evaluator.nearest_poses
     make = functools.partial(tracking_controller, env, poses, is_delayed=is_delayed)
-    rollouts, lead = _best(evaluator, make, _LEADS)
+    rollouts, lead = best_setting(evaluator, make, _LEADS)
     return rollouts, int(lead)
 
 
@@ -139,7 +139,7 @@ def one_step_controller(env: ImitationEnv, poses: Motions) -> Controller:
     return controller
 
 
-def _best(
+def best_setting(
     evaluator: Evaluator, make: Callable[[Array], Controller], settings: Sequence[float]
 ) -> tuple[Rollouts, float]:
     """The rollouts with the smallest distance on the training demonstrations, and the setting of their controller."""

@@ -1,6 +1,7 @@
 """The arm of an episode: masses, payload, friction, sensors and delays, drawn from the ranges of a world."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -58,24 +59,44 @@ def draw_episode(world: WorldConfig, randomization: RandomizationConfig, joints:
     """Draws an episode from the ranges of a world and a randomization."""
     keys = iter(jax.random.split(key, 11))
 
-    def uniform(bounds: list[float], *shape: int) -> Array:
+    def drawn(name: str, bounds: Sequence[float]) -> Array:
+        if name in _TICKS:
+            return jax.random.randint(next(keys), (), int(bounds[0]), int(bounds[1]) + 1)
+        shape = (joints,) if name in _OF_JOINTS else ()
         return jax.random.uniform(next(keys), shape, minval=bounds[0], maxval=bounds[1])
 
-    def ticks(bounds: list[int]) -> Array:
-        return jax.random.randint(next(keys), (), bounds[0], bounds[1] + 1)
+    numbers = {name: drawn(name, bounds) for name, bounds in _bounds(world, randomization).items()}
+    return Draw(load=Load(numbers.pop("mass"), numbers.pop("damping")), **numbers)
 
-    return Draw(
-        link_mass=uniform(world.link_mass, joints),
-        payload=uniform(world.payload),
-        payload_lever=uniform(world.payload_lever),
-        gravity_error=uniform(world.gravity_error),
-        friction=uniform(world.friction, joints),
-        gain=uniform(world.motor_gain, joints),
-        bias=uniform([-world.position_bias, world.position_bias], joints),
-        observation_delay=ticks(world.observation_delay),
-        action_delay=ticks(world.action_delay),
-        load=Load(uniform(randomization.mass), uniform(randomization.damping)),
-    )
+
+def drawn_fractions(draw: Draw, world: WorldConfig, randomization: RandomizationConfig) -> Float[Array, " numbers"]:
+    """What was drawn for an episode, each number from -1 to 1 over its range; without what is constant."""
+    numbers = vars(draw) | draw.load._asdict()
+    fractions = [jnp.zeros(0)]
+    for name, (minimum, maximum) in _bounds(world, randomization).items():
+        if minimum < maximum:
+            fractions.append(2 * jnp.atleast_1d(numbers[name] - minimum) / (maximum - minimum) - 1)
+    return jnp.concatenate(fractions)
+
+
+_OF_JOINTS, _TICKS = ("link_mass", "friction", "gain", "bias"), ("observation_delay", "action_delay")
+
+
+def _bounds(world: WorldConfig, randomization: RandomizationConfig) -> dict[str, Sequence[float]]:
+    """Minimum and maximum of each number of a `Draw`, in the order of their random keys."""
+    return {
+        "link_mass": world.link_mass,
+        "payload": world.payload,
+        "payload_lever": world.payload_lever,
+        "gravity_error": world.gravity_error,
+        "friction": world.friction,
+        "gain": world.motor_gain,
+        "bias": (-world.position_bias, world.position_bias),
+        "observation_delay": world.observation_delay,
+        "action_delay": world.action_delay,
+        "mass": randomization.mass,
+        "damping": randomization.damping,
+    }
 
 
 @dataclasses.dataclass(frozen=True)

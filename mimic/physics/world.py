@@ -61,6 +61,8 @@ class WorldConfig:
         of `mimic.deploy` takes 0.02 s to check a target; there the time is always that one.
       packet_loss: probability that an action does not arrive; the one before is then used again.
       start_noise: maximum deviation of each joint from the start pose [rad].
+      history: number of past ticks whose measured motion and actions the policy observes beside the present, so that it
+        can tell what was drawn.
       stops: whether joints have mechanical stops at the ends of their ranges.
       contacts: whether links touch each other and the floor. Only of `physics=mjx` and of the virtual robot.
       floor_height: of the floor in the base frame [m], negative for a robot on a pedestal.
@@ -81,6 +83,7 @@ class WorldConfig:
     action_latency: float = number(0.0, at_least=0.0, at_most=1.0)
     packet_loss: float = number(0.0, at_least=0.0, below=1.0)
     start_noise: float = number(0.0, at_least=0.0, at_most=1.0)
+    history: int = number(0, at_least=0, at_most=100)
     stops: bool = False
     contacts: bool = False
     floor_height: float = number(0.0, at_least=-100.0, at_most=100.0)

@@ -28,7 +28,7 @@ def _unset() -> Any:
 NETWORKS = ("mlp", "joints")
 LOOPS = ("mimic", "brax")
 # Settings that brax's loop lacks, with the values by which ours has none of them either.
-_WITHOUT_SCHEDULES = {"final_learning_rate": 1.0, "final_entropy_cost": 1.0, "timed_critic": False}
+_WITHOUT_SCHEDULES = {"final_learning_rate": 1.0, "final_entropy_cost": 1.0, "privileged_critic": False}
 LOGGERS = ("local", "wandb", "mlflow")
 
 # Factor on the number of evaluations with a target gap, so that training ends soon after the gap is reached: an
@@ -80,7 +80,7 @@ class PPOConfig(TrainerConfig):
       name: "ppo".
       preset: "cpu" or "gpu"; where the learner is drawn for each episode "any_arm_cpu" or "any_arm"; with an inner loop
         (`env.control`, `world`) "inner_loop_cpu" or "inner_loop"; or "auto", which follows JAX's backend.
-      loop: "mimic"; or "brax", brax's own training loop (`trainer=brax`), without schedules, `timed_critic` and
+      loop: "mimic"; or "brax", brax's own training loop (`trainer=brax`), without schedules, `privileged_critic` and
         `resume=`.
       num_timesteps: environment steps of the training, rounded up to whole training epochs; a training epoch is the
         training between two evaluations.
@@ -102,8 +102,8 @@ class PPOConfig(TrainerConfig):
       hidden_layers: widths of the hidden layers of the policy and value networks; with network "joints" of the latter.
       crossovers: number of additional training demonstrations, mixed joint by joint from the recorded ones, see
         `crossovers` in mimic/motions/demonstrations.py.
-      timed_critic: whether the value network also observes the elapsed fraction of the episode, on which the return
-        depends. The policy never observes it.
+      privileged_critic: whether the value network also observes what the policy never does: the elapsed fraction of the
+        episode and what was drawn for it, on which the return depends, see `ImitationEnv.privileged`.
       target_gap: training ends early when the optimality gap on the training demonstrations is at most this; 0 disables
         it.
       evaluations: number of evaluations and checkpoints, as far as whole batches allow; with a target gap five times
@@ -135,7 +135,7 @@ class PPOConfig(TrainerConfig):
     network: FromPreset[str] = _unset()
     hidden_layers: FromPreset[list[int]] = number(None, at_least=1, at_most=2**16, entries=(1, 32))
     crossovers: FromPreset[int] = number(None, at_least=0, at_most=100_000)
-    timed_critic: bool = True
+    privileged_critic: bool = True
     target_gap: float = number(0.0, at_least=0.0, at_most=100.0)
     evaluations: FromPreset[int] = number(None, at_least=1, at_most=1_000_000)
 

@@ -166,7 +166,7 @@ def test_a_checkpoint_of_another_environment(reason, run_dir, tmp_path):
 
 def test_a_run_of_braxs_loop_is_not_resumed(reason, tmp_path):
     (tmp_path / "run").mkdir()
-    trainer = PPOConfig(loop="brax", final_learning_rate=1.0, final_entropy_cost=1.0, timed_critic=False)
+    trainer = PPOConfig(loop="brax", final_learning_rate=1.0, final_entropy_cost=1.0, privileged_critic=False)
     save_config(tmp_path / "run", TrainConfig(environment(), trainer))
     assert "saves no training state" in reason("train", f"resume={tmp_path / 'run'}", "compilation_cache=")
 

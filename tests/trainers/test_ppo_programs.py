@@ -102,7 +102,7 @@ def test_a_loss_without_gradient_changes_nothing_but_the_episodes(one_batch):
 def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     """The entropy is that of a sample, drawn in the same order only for unrolls of one step."""
     sizes, unrolls = (5, 3), 6
-    config = PPOConfig(hidden_layers=[8, 4], entropy_cost=entropy_cost, timed_critic=False).resolve("cpu")
+    config = PPOConfig(hidden_layers=[8, 4], entropy_cost=entropy_cost, privileged_critic=False).resolve("cpu")
     setup = setup_of(config, *sizes)
     networks = setup.networks
     rng = np.random.default_rng(time)
@@ -153,7 +153,7 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     assert shown["clip_fraction"] == pytest.approx(clipped.mean()) and 0 < clipped.mean() < 1
 
 
-def test_a_timed_critic_observes_the_elapsed_time(x64):
+def test_a_privileged_critic_observes_the_elapsed_time(x64):
     """Its loss is that of a critic without time whose observation has the elapsed time as its last entry."""
     rng = np.random.default_rng(0)
     unrolls = ppo.Unrolls(*(jnp.asarray(rng.normal(size=(6, 4, *n))) for n in [(5,), (3,), (), (), (), ()]))
@@ -161,7 +161,7 @@ def test_a_timed_critic_observes_the_elapsed_time(x64):
     statistics = statistics.replace(mean=jnp.arange(5.0), std=1 + jnp.arange(5.0))
     longer = jax.tree.map(lambda x: x, statistics)
     longer = longer.replace(mean=jnp.append(statistics.mean, 0.0), std=jnp.append(statistics.std, 1.0))
-    timed, plain = (PPOConfig(hidden_layers=[8], timed_critic=timed).resolve("cpu") for timed in (True, False))
+    timed, plain = (PPOConfig(hidden_layers=[8], privileged_critic=timed).resolve("cpu") for timed in (True, False))
     params = setup_of(timed, 5, 3).networks.value_network.init(jax.random.PRNGKey(0))
     timed_loss, plain_loss = (
         jax.jit(functools.partial(ppo.value_loss, setup=setup))

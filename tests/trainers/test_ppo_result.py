@@ -14,7 +14,7 @@ from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import brax_loop, ppo
 from mimic.trainers.ppo.trainer import PPOTrainer
 
-WITHOUT_SCHEDULES: dict[str, Any] = {"final_learning_rate": 1.0, "final_entropy_cost": 1.0, "timed_critic": False}
+WITHOUT_SCHEDULES: dict[str, Any] = {"final_learning_rate": 1.0, "final_entropy_cost": 1.0, "privileged_critic": False}
 
 
 def run(monkeypatch, run_dir, values, last=None):

@@ -61,20 +61,30 @@ _AXIS = "devices"
 _REPLICATED, _SHARDED = PartitionSpec(), PartitionSpec(_AXIS)
 
 
-def make_networks(config: PPOConfig, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
-    """The policy and value network of the trainer's settings."""
+def make_networks(
+    config: PPOConfig, observation_size: int, action_size: int, privileged_size: int = 1
+) -> ppo_networks.PPONetworks:
+    """The policy and value network of the trainer's settings.
+
+    Args:
+      config: the settings.
+      observation_size: length of an observation.
+      action_size: length of an action.
+      privileged_size: length of `ImitationEnv.privileged`, which a privileged critic observes too.
+    """
     hidden = tuple(config.hidden_layers or ())
     layers = {"policy_hidden_layer_sizes": hidden, "value_hidden_layer_sizes": hidden}
     make = functools.partial(ppo_networks.make_ppo_networks, action_size=action_size, **layers)
     normalize = _normalize_bounded if config.network == "joints" else running_statistics.normalize
     networks = make(observation_size, preprocess_observations_fn=normalize)
-    if config.timed_critic:
+    if config.privileged_critic:
 
-        def normalize_all_but_last(observation: Array, statistics: RunningStatisticsState) -> Array:
-            return jnp.concatenate([normalize(observation[..., :-1], statistics), observation[..., -1:]], axis=-1)
+        def normalize_observation(inputs: Array, statistics: RunningStatisticsState) -> Array:
+            observation, privileged = jnp.split(inputs, [observation_size], axis=-1)
+            return jnp.concatenate([normalize(observation, statistics), privileged], axis=-1)
 
-        timed = make(observation_size + 1, preprocess_observations_fn=normalize_all_but_last)
-        networks = dataclasses.replace(networks, value_network=timed.value_network)
+        critic = make(observation_size + privileged_size, preprocess_observations_fn=normalize_observation)
+        networks = dataclasses.replace(networks, value_network=critic.value_network)
     if config.network == "joints":
         networks = dataclasses.replace(networks, policy_network=_joint_policy(observation_size))
     return networks
@@ -111,9 +121,9 @@ def initial_params(networks: ppo_networks.PPONetworks, observation_size: int, ke
     return statistics, networks.policy_network.init(key_policy), networks.value_network.init(key_value)
 
 
-def params_template(config: PPOConfig, observation_size: int, action_size: int) -> Params:
-    """The shapes of the parameters, with the structure of a checkpoint."""
-    networks = make_networks(config, observation_size, action_size)
+def params_template(config: PPOConfig, observation_size: int, action_size: int, privileged_size: int = 1) -> Params:
+    """The shapes of the parameters, with the structure of a checkpoint; see `make_networks`."""
+    networks = make_networks(config, observation_size, action_size, privileged_size)
     return jax.eval_shape(lambda: initial_params(networks, observation_size, jax.random.PRNGKey(0)))
 
 
@@ -168,7 +178,7 @@ def make_setup(env: ImitationEnv, config: PPOConfig, devices: int) -> Setup:
     def learning_rate(count: Any) -> Any:
         return config.learning_rate * (1 + progress(count) * (config.final_learning_rate - 1))
 
-    networks = make_networks(config, env.observation_size, env.action_size)
+    networks = make_networks(config, env.observation_size, env.action_size, env.privileged_size)
     return Setup(env, config, networks, optax.adam(learning_rate), progress, devices, a_process_for_each_gpu())
 
 
@@ -248,18 +258,18 @@ class Unrolls(NamedTuple):
     Attributes:
       observation: [*unrolls, time + 1, n] before the step.
       raw_action: [*unrolls, time + 1, m] sample of the policy's normal distribution, before the tanh.
+      privileged: [*unrolls, time + 1, k] `ImitationEnv.privileged` before the step; the last sample has it too.
       log_prob: [*unrolls, time + 1] log-probability of the action under the policy that took it.
       reward: [*unrolls, time + 1].
       goes_on: [*unrolls, time + 1] 0 where the episode ended with the step, else 1.
-      elapsed: [*unrolls, time + 1] fraction of the episode before the step; the final observation has it too.
     """
 
     observation: Array
     raw_action: Array
+    privileged: Array
     log_prob: Array
     reward: Array
     goes_on: Array
-    elapsed: Array
 
     def packed(self) -> Array:
         """All fields, concatenated along the last axis, so that one kernel gathers a minibatch."""
@@ -267,17 +277,17 @@ class Unrolls(NamedTuple):
 
     def unpacked(self, rows: Array) -> "Unrolls":
         """The unrolls of any number of rows of `packed`."""
-        ends = self.observation.shape[-1], self.observation.shape[-1] + self.raw_action.shape[-1]
-        observation, raw_action, rest = jnp.split(rows, ends, axis=-1)
-        return Unrolls(observation, raw_action, *jnp.moveaxis(rest, -1, 0))
+        ends = np.cumsum([x.shape[-1] for x in self[:3]])
+        *vectors, rest = jnp.split(rows, ends, axis=-1)
+        return Unrolls(*vectors, *jnp.moveaxis(rest, -1, 0))
 
 
 def collect(setup: Setup, env: Wrapper, state: TrainingState, key: Array) -> tuple[TrainingState, Unrolls]:
     """Steps all arms of a device; returns the state after it and unrolls [time + 1, arms, ...]."""
     policy = ppo_networks.make_inference_fn(setup.networks)(state.params)
 
-    def elapsed(episodes: State) -> Array:
-        return arm_state(episodes).step / setup.env.config.horizon
+    def privileged(episodes: State) -> Array:
+        return jax.vmap(setup.env.privileged)(arm_state(episodes))
 
     def step(episodes: State, key: Array) -> tuple[State, Unrolls]:
         action, extras = policy(episodes.obs, key)
@@ -285,17 +295,17 @@ def collect(setup: Setup, env: Wrapper, state: TrainingState, key: Array) -> tup
         taken = Unrolls(
             episodes.obs,  # type: ignore[arg-type]
             extras["raw_action"],
+            privileged(episodes),
             extras["log_prob"],
             after.reward,
             1 - after.done,
-            elapsed(episodes),
         )
         return after, taken
 
     keys = jax.random.split(key, setup.config.unroll_length)
     episodes, steps = jax.lax.scan(step, state.episodes, keys)
     last = jax.tree.map(lambda x: jnp.zeros_like(x[:1]), steps)
-    last = last._replace(observation=episodes.obs[None], elapsed=elapsed(episodes)[None])
+    last = last._replace(observation=episodes.obs[None], privileged=privileged(episodes)[None])
     steps = jax.tree.map(lambda *x: jnp.concatenate(x), steps, last)
     return dataclasses.replace(state, episodes=episodes), steps
 
@@ -318,8 +328,8 @@ def value_loss(
       setup: of the training; networks and config are used.
     """
     config, observation = setup.config, unrolls.observation
-    if config.timed_critic:
-        observation = jnp.concatenate([observation, unrolls.elapsed[..., None]], axis=-1)
+    if config.privileged_critic:
+        observation = jnp.concatenate([observation, unrolls.privileged], axis=-1)
     values = setup.networks.value_network.apply(statistics, params, observation)
     reward, goes_on = unrolls.reward[:, :-1], unrolls.goes_on[:, :-1]
     targets, advantages = jax.lax.stop_gradient(

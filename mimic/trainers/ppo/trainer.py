@@ -105,7 +105,8 @@ class PPOTrainer(Trainer):
         """Observation statistics and the parameters of policy and value network."""
         if self._shared is not None:
             return self._shared.params_template()
-        return ppo.params_template(self.settings, self._env.observation_size, self._env.action_size)
+        env = self._env
+        return ppo.params_template(self.settings, env.observation_size, env.action_size, env.privileged_size)
 
     def controller(self, params: Params) -> Controller | ControllerWithMemory:
         """The deterministic policy of these parameters."""

@@ -1,0 +1,185 @@
+"""Policies and model-based controllers on an arm whose masses, load, friction and delay are unknown.
+
+    python -m benchmarks.unknown --out FILE --runs RUN [RUN ...] [--count 64]
+
+RUN is a run directory of `python -m mimic.train env=panda7dof world=unknown`; runs that differ in nothing but their
+seed are one policy, named by `--names`. Each set of episodes has one of the world's ranges at full width and the others
+as the data sheet says; "all" has all of them. The motions are the test set's, `--count` of each kind.
+
+The controllers are computed torque along the poses of the kinematic bound, which know the motion in advance. They
+predict the state at which their torque will act, from the same measurements and actions that the policy observes, by a
+model: that of the data sheet with a delay of one tick ("nominal"), the same with a correction by the mean difference
+between the torques that were commanded and those that explain the measured motion of the last ticks ("observer"), or
+the arm as it is drawn, with its delay ("true"). Each has the best of several frequencies on the training
+demonstrations.
+"""
+
+import argparse
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import State
+
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import Row, collect
+from benchmarks.motions import policies_of, test_motions
+from mimic.base.compilation import use_compilation_cache
+from mimic.control.joint_control import Reference, Target, friction_torque
+from mimic.envs.imitation import arm_state
+from mimic.envs.world_env import HardwareEnv
+from mimic.envs.world_state import HardwareState
+from mimic.evaluation.rollout_metrics import gap_interval
+from mimic.evaluation.tracking_controllers import best_setting, reference_motions
+from mimic.physics import dynamics
+from mimic.physics.inner_loop import LoopState
+from mimic.physics.joint_numbers import NUMBERS, joint_of
+from mimic.physics.plant import Draw
+from mimic.physics.step import Load
+from mimic.physics.world import WorldConfig
+from mimic.runs.checkpoints import load_checkpoint
+from mimic.trainers.config import TrainConfig
+from mimic.trainers.make import make_ppo_trainer
+
+Array = Any
+FREQUENCIES = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # candidates [rad/s]
+COLUMNS = "env set controller gap:.2% low:.2% high:.2% seeds demonstrations setting"
+DATA_SHEET = WorldConfig(gravity=True, friction=[1.0, 1.0], action_delay=[1, 1], stops=True)
+RANGES = {
+    "none": (),
+    "mass": ("link_mass",),
+    "payload": ("payload", "payload_lever"),
+    "compensation": ("gravity_error",),
+    "friction": ("friction",),
+    "delay": ("action_delay",),
+}
+
+
+def worlds(trained: WorldConfig) -> Iterator[tuple[str, WorldConfig]]:
+    """The world of each set: ranges of the training's world, the others as in the data sheet."""
+    unknown = {name for names in RANGES.values() for name in names}
+    for set_name, ranges in RANGES.items():
+        known = {name: getattr(DATA_SHEET, name) for name in unknown.difference(ranges)}
+        yield set_name, dataclasses.replace(trained, **known)
+    yield "all", trained
+
+
+def data_sheet(env: HardwareEnv) -> Draw:
+    """The model that a controller has without measuring the arm."""
+    ones, one, zero = jnp.ones(env.learner.num_joints), jnp.ones(()), jnp.zeros(())
+    delay = jnp.asarray(DATA_SHEET.action_delay[0])
+    return Draw(ones, zero, zero, zero, ones, ones, 0 * ones, 0 * delay, delay, Load(one, one))
+
+
+def model_torque(env: HardwareEnv, draw: Draw, qpos: Array, qvel: Array, qacc: Array) -> Array:
+    """The commanded torque that makes an acceleration by a model [N m]."""
+    episode = env.plant.episode(draw)
+    joints = [joint_of(episode.numbers[NUMBERS * i : NUMBERS * (i + 1)], i - 1) for i in range(len(qpos))]
+    torque = jnp.stack(dynamics.inverse(joints, list(qpos), list(qvel), list(qacc), tuple(episode.base)))
+    return (torque + friction_torque(qvel, episode.friction, env.plant.constants.friction_rate, jnp)) / episode.gain
+
+
+def predicted(env: HardwareEnv, draw: Draw, episode: HardwareState) -> tuple[Array, Array]:
+    """Angles and velocities at which the next action will act, by a model from the last measurement."""
+    qpos, qvel, *_ = jnp.split(episode.measured[0], 4)
+    still = Reference(qpos, 0 * qvel, 0 * qvel)
+    before = Target(0 * qpos, jnp.ones_like(qpos))
+    for age in reversed(range(max(env.world.action_delay))):  # the action that acts first is the oldest
+        torque = episode.sent[jnp.minimum(age + 1, len(episode.sent) - 1)] * env.parameters.torque_scale
+        after, _ = env.tick(draw, LoopState(qpos, qvel, still, torque), before, episode.sent[age])
+        acts = age < draw.action_delay
+        qpos, qvel = jnp.where(acts, after.qpos, qpos), jnp.where(acts, after.qvel, qvel)
+    return qpos, qvel
+
+
+def missing_torque(env: HardwareEnv, draw: Draw, episode: HardwareState) -> Array:
+    """Mean torque of the last ticks that a model lacks to explain the measured motion [N m]."""
+    ticks = len(episode.sent) - int(DATA_SHEET.action_delay[0])
+    qpos, qvel, *_ = jnp.split(episode.measured[: ticks + 1], 4, axis=1)
+    qacc = (qvel[:-1] - qvel[1:]) / env.config.control_dt
+    middle = [(x[:-1] + x[1:]) / 2 for x in (qpos, qvel)]
+    needed = jax.vmap(functools.partial(model_torque, env, draw))(*middle, qacc)
+    commanded = episode.sent[int(DATA_SHEET.action_delay[0]) :] * env.parameters.torque_scale
+    return (commanded - needed).mean(axis=0)
+
+
+def controllers(env: HardwareEnv) -> dict[str, Callable[[Array], Callable[[State], Array]]]:
+    """Functions from a frequency to each controller."""
+    qpos, qvel = (jnp.asarray(x, jnp.float32) for x in reference_motions(env))
+    nominal, dt = data_sheet(env), env.config.control_dt
+
+    def make(name: str, frequency: Array) -> Callable[[State], Array]:
+        def controller(state: State) -> Array:
+            episode = cast(HardwareState, arm_state(state))
+            model = episode.draw if name == "true" else nominal
+            angles, velocities = predicted(env, model, episode)
+            now = jnp.minimum(episode.step + model.action_delay, env.config.horizon - 1)
+            motion, later = episode.demonstration, now + 1
+            acceleration = (qvel[motion, later] - qvel[motion, now]) / dt
+            error, rate_error = qpos[motion, now] - angles, qvel[motion, now] - velocities
+            desired = acceleration + frequency**2 * error + 2 * frequency * rate_error
+            torque = model_torque(env, model, angles, velocities, desired)
+            if name == "observer":
+                torque = torque + missing_torque(env, model, episode)
+            return torque / env.parameters.torque_scale
+
+        return controller
+
+    return {name: functools.partial(make, name) for name in ("nominal", "observer", "true")}
+
+
+def rows(options: argparse.Namespace) -> Iterator[Row]:
+    """The rows of all sets."""
+    groups = policies_of(options.runs)
+    first = groups[0][0][1]
+    assert first.env.world is not None
+    with_history = max((config for policies in groups for _, config in policies), key=lambda c: c.env.world.history)
+    unseen = test_motions(first.env, options.count)
+    for set_name, world in worlds(with_history.env.world):
+        for name, policies in zip(options.names, groups, strict=True):
+            gaps, part = [], slice(0)
+            for run, config in policies:
+                trainer = _trainer(config, run, dataclasses.replace(world, history=config.env.world.history), unseen)
+                params = load_checkpoint(run, trainer.params_template(), None)[1]
+                gaps.append(np.asarray(trainer.evaluate(params).distance))
+                part = trainer.evaluator.parts["held_out"]
+            yield _row(set_name, name, trainer.evaluator, part, gaps, None)
+        trainer = _trainer(with_history, options.runs[0], world, unseen)
+        evaluator = trainer.evaluator
+        part = evaluator.parts["held_out"]
+        for name, make in controllers(cast(HardwareEnv, evaluator.env)).items():
+            rollouts, frequency = best_setting(evaluator, make, FREQUENCIES)
+            yield _row(set_name, name, evaluator, part, [np.asarray(rollouts.distance)], frequency)
+
+
+def _trainer(config: TrainConfig, run: Path, world: WorldConfig, unseen: Any) -> Any:
+    changed = dataclasses.replace(config, env=dataclasses.replace(config.env, world=world))
+    return make_ppo_trainer(changed, run, unseen, None)
+
+
+def _row(set_name: str, controller: str, evaluator: Any, part: slice, distances: list[Array], setting: Any) -> Row:
+    distance = np.stack([x[part].mean(axis=1, dtype=float) for x in distances])
+    bound, hold = (x[part].mean(axis=1, dtype=float) for x in (evaluator.lower_bound, evaluator.hold_distance))
+    gap, low, high = gap_interval(distance, bound, hold)
+    env = evaluator.env.config.name
+    numbers = {"gap": gap, "low": low, "high": high, "seeds": len(distance), "demonstrations": distance.shape[1]}
+    return {"env": env, "set": set_name, "controller": controller, **numbers, "setting": setting}
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = make_parser("unknown", __doc__, count=64)
+    parser.add_argument("--runs", nargs="+", type=Path, required=True, metavar="RUN")
+    parser.add_argument("--names", nargs="+", required=True, metavar="NAME", help="of the policies, in order")
+    options = parser.parse_args()
+    use_compilation_cache("~/.cache/mimic/jax")
+    collect(options, rows(options), "rows", COLUMNS)
+
+
+if __name__ == "__main__":
+    main()
