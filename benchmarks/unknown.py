@@ -1,6 +1,6 @@
 """Policies and model-based controllers on an arm whose masses, load, friction and delay are unknown.
 
-    python -m benchmarks.unknown --out FILE --runs RUN [RUN ...] [--count 64]
+    python -m benchmarks.unknown --out FILE --runs RUN [RUN ...] --names NAME [NAME ...] [--sets NAME ...] [--count 64]
 
 RUN is a run directory of `python -m mimic.train env=panda7dof world=unknown`; runs that differ in nothing but their
 seed are one policy, named by `--names`. Each set of episodes has one of the world's ranges at full width and the others
@@ -34,8 +34,10 @@ from mimic.control.joint_control import Reference, Target, friction_torque
 from mimic.envs.imitation import arm_state
 from mimic.envs.world_env import HardwareEnv
 from mimic.envs.world_state import HardwareState
+from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.rollout_metrics import gap_interval
 from mimic.evaluation.tracking_controllers import best_setting, reference_motions
+from mimic.motions.demonstrations import Demonstrations
 from mimic.physics import dynamics
 from mimic.physics.inner_loop import LoopState
 from mimic.physics.joint_numbers import NUMBERS, joint_of
@@ -45,10 +47,11 @@ from mimic.physics.world import WorldConfig
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.make import make_ppo_trainer
+from mimic.trainers.ppo.trainer import PPOTrainer
 
 Array = Any
 FREQUENCIES = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # candidates [rad/s]
-COLUMNS = "env set controller gap:.2% low:.2% high:.2% seeds demonstrations setting"
+COLUMNS = "env set controller gap:.2% low:.2% high:.2% seeds demonstrations frequency"
 DATA_SHEET = WorldConfig(gravity=True, friction=[1.0, 1.0], action_delay=[1, 1], stops=True)
 RANGES = {
     "none": (),
@@ -136,44 +139,44 @@ def controllers(env: HardwareEnv) -> dict[str, Callable[[Array], Callable[[State
 def rows(options: argparse.Namespace) -> Iterator[Row]:
     """The rows of all sets."""
     groups = policies_of(options.runs)
-    first = groups[0][0][1]
-    assert first.env.world is not None
-    with_history = max((config for policies in groups for _, config in policies), key=lambda c: c.env.world.history)
-    unseen = test_motions(first.env, options.count)
-    for set_name, world in worlds(with_history.env.world):
+    histories = [cast(WorldConfig, policies[0][1].env.world).history for policies in groups]
+    run, config = groups[int(np.argmax(histories))][0]
+    unseen = test_motions(config.env, options.count)
+    for set_name, world in worlds(cast(WorldConfig, config.env.world)):
+        if set_name not in options.sets:
+            continue
         for name, policies in zip(options.names, groups, strict=True):
-            gaps, part = [], slice(0)
-            for run, config in policies:
-                trainer = _trainer(config, run, dataclasses.replace(world, history=config.env.world.history), unseen)
-                params = load_checkpoint(run, trainer.params_template(), None)[1]
-                gaps.append(np.asarray(trainer.evaluate(params).distance))
-                part = trainer.evaluator.parts["held_out"]
-            yield _row(set_name, name, trainer.evaluator, part, gaps, None)
-        trainer = _trainer(with_history, options.runs[0], world, unseen)
-        evaluator = trainer.evaluator
-        part = evaluator.parts["held_out"]
+            trainer = _trainer(*policies[0], world, unseen)
+            params = [load_checkpoint(run, trainer.params_template(), None)[1] for run, _ in policies]
+            distances = [np.asarray(trainer.evaluate(of_seed).distance) for of_seed in params]
+            yield _row(set_name, name, trainer.evaluator, distances)
+        evaluator = _trainer(run, config, world, unseen).evaluator
         for name, make in controllers(cast(HardwareEnv, evaluator.env)).items():
             rollouts, frequency = best_setting(evaluator, make, FREQUENCIES)
-            yield _row(set_name, name, evaluator, part, [np.asarray(rollouts.distance)], frequency)
+            yield {**_row(set_name, name, evaluator, [np.asarray(rollouts.distance)]), "frequency": frequency}
 
 
-def _trainer(config: TrainConfig, run: Path, world: WorldConfig, unseen: Any) -> Any:
-    changed = dataclasses.replace(config, env=dataclasses.replace(config.env, world=world))
+def _trainer(run: Path, config: TrainConfig, world: WorldConfig, unseen: Demonstrations) -> PPOTrainer:
+    """The trainer of a run in another world, with the run's own history."""
+    own = dataclasses.replace(world, history=cast(WorldConfig, config.env.world).history)
+    changed = dataclasses.replace(config, env=dataclasses.replace(config.env, world=own))
     return make_ppo_trainer(changed, run, unseen, None)
 
 
-def _row(set_name: str, controller: str, evaluator: Any, part: slice, distances: list[Array], setting: Any) -> Row:
+def _row(
+    set_name: str, controller: str, evaluator: Evaluator, part: slice, distances: list[Array], setting: Any
+) -> Row:
     distance = np.stack([x[part].mean(axis=1, dtype=float) for x in distances])
     bound, hold = (x[part].mean(axis=1, dtype=float) for x in (evaluator.lower_bound, evaluator.hold_distance))
     gap, low, high = gap_interval(distance, bound, hold)
     env = evaluator.env.config.name
     numbers = {"gap": gap, "low": low, "high": high, "seeds": len(distance), "demonstrations": distance.shape[1]}
-    return {"env": env, "set": set_name, "controller": controller, **numbers, "setting": setting}
+    return {"env": env, "set": set_name, "controller": controller, **numbers}
 
 
 def main() -> None:
     """Measures and prints."""
-    parser = make_parser("unknown", __doc__, count=64)
+    parser = make_parser("unknown", __doc__, sets=(*RANGES, "all"), count=64)
     parser.add_argument("--runs", nargs="+", type=Path, required=True, metavar="RUN")
     parser.add_argument("--names", nargs="+", required=True, metavar="NAME", help="of the policies, in order")
     options = parser.parse_args()

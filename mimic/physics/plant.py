@@ -70,13 +70,14 @@ def draw_episode(world: WorldConfig, randomization: RandomizationConfig, joints:
 
 
 def drawn_fractions(draw: Draw, world: WorldConfig, randomization: RandomizationConfig) -> Float[Array, " numbers"]:
-    """What was drawn for an episode, each number from -1 to 1 over its range; without what is constant."""
+    """What was drawn for an episode, each number from -1 to 1 over its range, 0 where that has no width."""
     numbers = vars(draw) | draw.load._asdict()
-    fractions = [jnp.zeros(0)]
-    for name, (minimum, maximum) in _bounds(world, randomization).items():
-        if minimum < maximum:
-            fractions.append(2 * jnp.atleast_1d(numbers[name] - minimum) / (maximum - minimum) - 1)
-    return jnp.concatenate(fractions)
+    return jnp.concatenate(
+        [
+            jnp.atleast_1d(2 * numbers[name] - minimum - maximum) / ((maximum - minimum) or 1.0)
+            for name, (minimum, maximum) in _bounds(world, randomization).items()
+        ]
+    )
 
 
 _OF_JOINTS, _TICKS = ("link_mass", "friction", "gain", "bias"), ("observation_delay", "action_delay")
