@@ -163,9 +163,8 @@ def _trainer(run: Path, config: TrainConfig, world: WorldConfig, unseen: Demonst
     return make_ppo_trainer(changed, run, unseen, None)
 
 
-def _row(
-    set_name: str, controller: str, evaluator: Evaluator, part: slice, distances: list[Array], setting: Any
-) -> Row:
+def _row(set_name: str, controller: str, evaluator: Evaluator, distances: list[Array]) -> Row:
+    part = evaluator.parts["held_out"]
     distance = np.stack([x[part].mean(axis=1, dtype=float) for x in distances])
     bound, hold = (x[part].mean(axis=1, dtype=float) for x in (evaluator.lower_bound, evaluator.hold_distance))
     gap, low, high = gap_interval(distance, bound, hold)
