@@ -50,7 +50,7 @@ from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.ppo.trainer import PPOTrainer
 
 Array = Any
-FREQUENCIES = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # candidates [rad/s]
+FREQUENCIES = (2.0, 4.0, 6.0, 8.0)  # candidates [rad/s]
 COLUMNS = "env set controller gap:.2% low:.2% high:.2% seeds demonstrations frequency"
 DATA_SHEET = WorldConfig(gravity=True, friction=[1.0, 1.0], action_delay=[1, 1], stops=True)
 RANGES = {
