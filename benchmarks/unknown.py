@@ -105,8 +105,8 @@ def missing_torque(env: HardwareEnv, draw: Draw, episode: HardwareState) -> Arra
     ticks = len(episode.sent) - int(DATA_SHEET.action_delay[0])
     qpos, qvel, *_ = jnp.split(episode.measured[: ticks + 1], 4, axis=1)
     qacc = (qvel[:-1] - qvel[1:]) / env.config.control_dt
-    middle = [(x[:-1] + x[1:]) / 2 for x in (qpos, qvel)]
-    needed = jax.vmap(functools.partial(model_torque, env, draw))(*middle, qacc)
+    middle_qpos, middle_qvel = ((x[:-1] + x[1:]) / 2 for x in (qpos, qvel))
+    needed = jax.vmap(functools.partial(model_torque, env, draw))(middle_qpos, middle_qvel, qacc)
     commanded = episode.sent[int(DATA_SHEET.action_delay[0]) :] * env.parameters.torque_scale
     return (commanded - needed).mean(axis=0)
 

@@ -116,6 +116,24 @@ def hardware_tracking(results: Results) -> list[Cells]:
     return rows
 
 
+UNKNOWN = {
+    "history": "policy with history",
+    "present": "without",
+    "nominal": "computed torque, data sheet",
+    "observer": "corrected",
+    "true": "computed torque, true model",
+}
+UNKNOWN_SETS = {"none": "nothing", "compensation": "gravity compensation", "all": "all of them"}
+
+
+def unknown(results: Results) -> list[Cells]:
+    rows: list[Cells] = [("unknown, gap [%]", *UNKNOWN.values())]
+    for name in dict.fromkeys(row["set"] for row in results["rows"]):
+        of_set = [one(results["rows"], set=name, controller=controller) for controller in UNKNOWN]
+        rows.append((UNKNOWN_SETS.get(str(name), str(name)), *(f"{100 * row['gap']:.2f}" for row in of_set)))
+    return rows
+
+
 def robot_loops(results: Results) -> list[Cells]:
     loops = ("mimic", "ruckig")
     rows: list[Cells] = [("held-out gap", *(f"`robot_loop={loop}`" for loop in loops))]

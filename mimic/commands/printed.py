@@ -11,7 +11,7 @@ from mimic.commands.arm_keys import ROLES
 from mimic.envs import env_config, environments
 from mimic.envs.config import EnvConfig
 
-_WORLDS = (None, "ideal", "nominal", "hardware")
+_WORLDS = (None, "ideal", "nominal", "hardware", "unknown")
 
 
 def train_command(env: EnvConfig) -> str:

@@ -15,7 +15,7 @@ from mimic.base.overrides import setting, shell_words
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, DEMONSTRATIONS
 from mimic.runs.lock import LOCK
-from mimic.trainers.config import TrainConfig, trainer_config
+from mimic.trainers.config import PPOConfig, TrainConfig, trainer_config
 from mimic.trainers.run_models import MODELS, with_original_models, with_saved_models
 from mimic.trainers.run_plugins import PLUGINS, check_plugins
 
@@ -53,9 +53,16 @@ def save_config(run_dir: Path, config: TrainConfig) -> None:
     write_atomically(run_dir / CONFIG, OmegaConf.to_yaml(OmegaConf.create(to_dict(config))))
 
 
-def resume_command(run_dir: Path) -> str:
-    """The command that continues a run."""
-    return f"python -m mimic.train {shell_words([setting('resume', str(run_dir))])}"
+def is_brax(config: TrainConfig) -> bool:
+    """Whether a run trains by brax's own loop, which cannot resume."""
+    return isinstance(config.trainer, PPOConfig) and config.trainer.loop == "brax"
+
+
+def how_to_continue(run_dir: Path, config: TrainConfig) -> str:
+    """How to continue a run, as the end of a message."""
+    if is_brax(config):
+        return f"brax's loop saves no training state; {setting('init', str(run_dir))} starts a run from its policy"
+    return f"continue with: python -m mimic.train {shell_words([setting('resume', str(run_dir))])}"
 
 
 def run_schema(trainer: str) -> DictConfig:

@@ -33,11 +33,19 @@ from mimic.runs.metrics_log import MetricsLog
 from mimic.runs.provenance import hardware
 from mimic.runs.signals import Interrupted, Signals, noted_signals
 from mimic.runs.stopwatch import Stopwatch
-from mimic.trainers.config import PPOConfig, TrainConfig
+from mimic.trainers.config import TrainConfig
 from mimic.trainers.make import make_trainer
 from mimic.trainers.progress import TrainingProgress
 from mimic.trainers.report import make_report, show_report
-from mimic.trainers.run_config import check_new_run, load_config, new_run_dir, resume_command, run_schema, save_config
+from mimic.trainers.run_config import (
+    check_new_run,
+    how_to_continue,
+    is_brax,
+    load_config,
+    new_run_dir,
+    run_schema,
+    save_config,
+)
 from mimic.trainers.run_models import own_arms, save_models
 from mimic.trainers.run_plugins import save_plugins
 from mimic.trainers.trainer import Params, Trainer
@@ -78,14 +86,13 @@ def prepare_training(
     if resumed_dir:
         config = _resumed_config(resumed_dir, config, overrides)
         check_writable("resume", resumed_dir)
-    is_braxs = isinstance(config.trainer, PPOConfig) and config.trainer.loop == "brax"
-    if resumed_dir and is_braxs:
+    if resumed_dir and is_brax(config):
         raise ValueError(
             "resume: expected a run of trainer.loop=mimic, got one of brax's loop, which saves no training state; "
             "init=RUN starts from its policy"
         )
-    if group and (is_braxs or config.trainer.name != "ppo"):
-        name = "brax" if is_braxs else config.trainer.name
+    if group and (is_brax(config) or config.trainer.name != "ppo"):
+        name = "brax" if is_brax(config) else config.trainer.name
         raise ValueError(f"distributed: expected trainer=ppo, got {name}, which trains in one process")
     is_first = group is None or group.first
     if not resumed_dir:
@@ -183,7 +190,7 @@ def _train(
             with _memory_errors():
                 report = run_training(*inputs, lock=lock, restored=restored, on_trained=end)
         except (Interrupted, Diverged, OSError, RunExists) as error:
-            exit_code = _stopped(console, run_dir, error)
+            exit_code = _stopped(console, run_dir, config, error)
             if group:
                 group.end(exit_code)
             return exit_code
@@ -292,11 +299,12 @@ def _new_run(run_dir: Path, trainer: Trainer) -> RunLock:
     return lock
 
 
-def _stopped(console: Console, run_dir: Path, error: Interrupted | Diverged | OSError | RunExists) -> int:
+def _stopped(
+    console: Console, run_dir: Path, config: TrainConfig, error: Interrupted | Diverged | OSError | RunExists
+) -> int:
     """Prints why a training stopped and how to continue; returns the exit code."""
-    command = resume_command(run_dir)
     if isinstance(error, Interrupted):
-        console.print(f"stopped by {error}; continue with: {command}", soft_wrap=True)
+        console.print(f"stopped by {error}; {how_to_continue(run_dir, config)}", soft_wrap=True)
         return error.exit_code
     if isinstance(error, Diverged):
         print(f"error: {error}; the checkpoints before it are kept in {run_dir}", file=sys.stderr)
@@ -304,7 +312,7 @@ def _stopped(console: Console, run_dir: Path, error: Interrupted | Diverged | OS
     if isinstance(error, RunExists):
         print(f"error: {error}", file=sys.stderr)
         return BAD_INPUT
-    again = f"continue with: {command}" if (run_dir / CONFIG).is_file() else "start the run again"
+    again = how_to_continue(run_dir, config) if (run_dir / CONFIG).is_file() else "start the run again"
     print(f"error: {error}; once this is solved, {again}", file=sys.stderr)
     return FAILED
 

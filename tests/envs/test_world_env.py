@@ -61,6 +61,7 @@ def test_without_a_world_it_is_the_environment_of_the_paper():
     assert type(mimic.make("panda4dof", demonstrations=FEW, world="paper")) is ImitationEnv
     assert mimic.env_config("panda4dof", world="paper") == mimic.env_config("panda4dof")
     assert mimic.env_config("panda4dof", world="hardware").kind == "inner_loop"
+    assert mimic.env_config("panda4dof", world="unknown").control == "torque"
 
 
 @pytest.mark.slow_for("1")
@@ -101,6 +102,34 @@ def test_a_delayed_observation_has_old_measurements_and_new_actions(nominal, act
     np.testing.assert_allclose(new.obs, control_observation(env, measured, sent, expert_vector(expert)), atol=1e-5)
     np.testing.assert_allclose(measured[:joints], old.pipeline_state.qpos, atol=1e-7)  # nominal: no noise, no bias
     np.testing.assert_allclose(new.pipeline_state.qpos, undelayed[-1].pipeline_state.qpos, atol=1e-6)
+
+
+def test_a_history_shows_the_measured_motion_of_past_ticks(nominal, actions, undelayed):
+    """As displacements from the present angles and as velocities, the newest first, and as many past actions."""
+    past, joints = 4, nominal.learner.num_joints
+    state = roll(with_world(nominal, history=past), actions)[-1]
+    qpos, qvel = (
+        np.stack([getattr(undelayed[TICKS - 2 - k].pipeline_state, name) for k in range(past)])
+        for name in ("qpos", "qvel")
+    )
+    displacement, velocity = np.split(np.asarray(state.obs[-2 * past * joints :]).reshape(2, past, joints), 2)
+    np.testing.assert_allclose(displacement[0], qpos - undelayed[-1].pipeline_state.qpos, atol=1e-6)
+    np.testing.assert_allclose(velocity[0], qvel, atol=1e-6)
+    sent = state.obs[-2 * past * joints - past * nominal.action_size : -2 * past * joints]
+    np.testing.assert_allclose(sent.reshape(past, -1), actions[::-1][:past], atol=1e-7)
+
+
+def test_a_critic_observes_what_was_drawn():
+    """Each number from -1 to 1 over its range; 0 where it is constant. The policy observes none of it."""
+    env = make(world="unknown")
+    states = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.PRNGKey(0), 200))
+    privileged = np.asarray(jax.vmap(env.privileged)(states))
+    assert privileged.shape == (200, env.privileged_size) and np.abs(privileged).max() <= 1 + 1e-6
+    joints = env.learner.num_joints
+    payload = privileged[:, 1 + joints]
+    np.testing.assert_allclose(payload, np.asarray(states.draw.payload) / 1.5 - 1, atol=1e-6)
+    is_constant = np.ptp(privileged, axis=0) == 0
+    assert np.all(privileged[:, is_constant] == 0) and 0 < is_constant.sum() < is_constant.size - 2 * joints
 
 
 def test_a_lost_action_is_replaced_by_the_one_before(nominal, actions):

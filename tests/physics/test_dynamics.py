@@ -5,6 +5,7 @@ import dataclasses
 import itertools
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
 from mimic.physics import dynamics
+from mimic.physics.joint_numbers import joints_of_model
 from tests.helpers.array_cases import (
     Batch,
     acceleration,
@@ -137,6 +139,17 @@ def test_a_locked_joint_without_inertia_is_harmless(x64):
         torque = TORQUES(stack_arms([arm] * COUNT), *motion)[0]
         np.testing.assert_allclose(torque[:6], 0.3, atol=1e-12)  # rounding
         assert torque[6] == 0
+
+
+def test_the_inverse_holds_on_an_accelerated_base(x64):
+    """As under gravity: forward dynamics of its torques give the accelerations again."""
+    joints, rng = joints_of_model(build_arm(ArmConfig()).model), np.random.default_rng(0)
+    qpos, qvel, qacc = (list(jnp.asarray(rng.normal(size=7))) for _ in range(3))
+    base = (0.3, -2.0, 9.0)
+    torque = dynamics.inverse(joints, qpos, qvel, qacc, base)
+    forward = dynamics.acceleration(dynamics.loaded(joints, 1.0, 1.0), qpos, qvel, torque, base)
+    np.testing.assert_allclose(forward, qacc, rtol=1e-9)
+    assert np.abs(np.subtract(torque, dynamics.inverse(joints, qpos, qvel, qacc))).max() > 10  # weight of the arm
 
 
 def test_damping_and_armature_enter_the_inverse(x64, batch):

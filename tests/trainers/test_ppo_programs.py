@@ -29,7 +29,7 @@ _SCHEDULING = "xla_gpu_command_buffer_scheduling_mode"
 
 def setup_of(config, observation_size, action_size):
     """The setup of a training of which no environment is stepped."""
-    env: Any = SimpleNamespace(observation_size=observation_size, action_size=action_size)
+    env: Any = SimpleNamespace(observation_size=observation_size, action_size=action_size, privileged_size=1)
     return ppo.make_setup(env, config, devices=1)
 
 
@@ -49,7 +49,7 @@ def one_batch():
         return now + 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), after
 
     def of_policy(params, statistics, unrolls, after, *_):
-        metrics = jnp.full(len(ppo.POLICY_METRICS), after).at[1:3].set(unrolls.elapsed.mean(axis=0))
+        metrics = jnp.full(len(ppo.POLICY_METRICS), after).at[1:3].set(unrolls.privileged[..., 0].mean(axis=0))
         return 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), metrics
 
     with pytest.MonkeyPatch.context() as patch:
@@ -116,7 +116,8 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     observation, raw_action = normal(unrolls, time + 1, 5), normal(unrolls, time + 1, 3)
     log_prob, reward = normal(unrolls, time + 1), normal(unrolls, time + 1)
     goes_on = jnp.asarray(rng.random((unrolls, time + 1)) < 0.8, float)
-    ours = ppo.Unrolls(observation, raw_action, log_prob - 4, reward, goes_on, jnp.zeros_like(reward))
+    privileged = jnp.zeros((*reward.shape, 2))
+    ours = ppo.Unrolls(observation, raw_action, privileged, log_prob - 4, reward, goes_on)
     np.testing.assert_array_equal(ours.unpacked(ours.packed()).raw_action, raw_action)
     now = jax.tree.map(lambda x: x[:, :-1], ours.unpacked(ours.packed()))
     extras = {"raw_action": now.raw_action, "log_prob": now.log_prob}
@@ -153,24 +154,24 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     assert shown["clip_fraction"] == pytest.approx(clipped.mean()) and 0 < clipped.mean() < 1
 
 
-def test_a_privileged_critic_observes_the_elapsed_time(x64):
-    """Its loss is that of a critic without time whose observation has the elapsed time as its last entry."""
+def test_a_privileged_critic_observes_more_than_the_policy(x64):
+    """Its loss is that of a critic whose observation has the privileged numbers as its last entries."""
     rng = np.random.default_rng(0)
-    unrolls = ppo.Unrolls(*(jnp.asarray(rng.normal(size=(6, 4, *n))) for n in [(5,), (3,), (), (), (), ()]))
+    unrolls = ppo.Unrolls(*(jnp.asarray(rng.normal(size=(6, 4, *n))) for n in [(5,), (3,), (1,), (), (), ()]))
     statistics = running_statistics.init_state(specs.Array((5,), jnp.dtype("float64")))
     statistics = statistics.replace(mean=jnp.arange(5.0), std=1 + jnp.arange(5.0))
     longer = jax.tree.map(lambda x: x, statistics)
     longer = longer.replace(mean=jnp.append(statistics.mean, 0.0), std=jnp.append(statistics.std, 1.0))
-    timed, plain = (PPOConfig(hidden_layers=[8], privileged_critic=timed).resolve("cpu") for timed in (True, False))
-    params = setup_of(timed, 5, 3).networks.value_network.init(jax.random.PRNGKey(0))
-    timed_loss, plain_loss = (
+    informed, plain = (PPOConfig(hidden_layers=[8], privileged_critic=is_so).resolve("cpu") for is_so in (True, False))
+    params = setup_of(informed, 5, 3).networks.value_network.init(jax.random.PRNGKey(0))
+    informed_loss, plain_loss = (
         jax.jit(functools.partial(ppo.value_loss, setup=setup))
-        for setup in (setup_of(timed, 5, 3), setup_of(plain, 6, 3))
+        for setup in (setup_of(informed, 5, 3), setup_of(plain, 6, 3))
     )
-    loss, _ = timed_loss(params, statistics, unrolls)
-    extended = unrolls._replace(observation=jnp.concatenate([unrolls.observation, unrolls.elapsed[..., None]], -1))
+    loss, _ = informed_loss(params, statistics, unrolls)
+    extended = unrolls._replace(observation=jnp.concatenate([unrolls.observation, unrolls.privileged], -1))
     expected, _ = plain_loss(params, longer, extended)
-    later, _ = timed_loss(params, statistics, unrolls._replace(elapsed=unrolls.elapsed + 1))
+    later, _ = informed_loss(params, statistics, unrolls._replace(privileged=unrolls.privileged + 1))
     assert loss == pytest.approx(float(expected), rel=1e-12) and abs(later - loss) > 1e-3
 
 

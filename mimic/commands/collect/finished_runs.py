@@ -15,7 +15,8 @@ from mimic.base.files import read_json, read_text
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import CONFIG, METRICS, REPORT
 from mimic.runs.sweeps.sweeper import LOGS, SWEEP
-from mimic.trainers.run_config import load_config, resume_command
+from mimic.trainers.config import TrainConfig
+from mimic.trainers.run_config import how_to_continue, load_config
 
 # Keys that no result depends on.
 _PROCESS_KEYS = ("run_dir", "resume", "logger", "compilation_cache", "distributed")
@@ -147,7 +148,6 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
     version = _version(report or {})
     try:
         config = load_config(path, saved_models=False)  # runs of one arm are compared by its original path
-        total = config.trainer.total_steps
     except ValueError as error:
         return LeftOut(name, f"{_other_version(version) if report else ''}{error}")
     try:
@@ -155,7 +155,7 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
     except (ValueError, OSError, csv.Error) as error:
         return LeftOut(name, f"{METRICS} cannot be read: {error}")
     if report is None:
-        return LeftOut(name, _progress(path, total, history))
+        return LeftOut(name, _progress(path, config, history))
     metric = quality_metric(config.trainer.name)
     if metric is None:
         return LeftOut(name, f"trainer {config.trainer.name} has no quality_metric")
@@ -199,10 +199,10 @@ def _evaluation_settings(
     }
 
 
-def _progress(path: Path, total: int, history: Mapping[str, Mapping[int, float]]) -> str:
+def _progress(path: Path, config: TrainConfig, history: Mapping[str, Mapping[int, float]]) -> str:
     step = max((step for column in history.values() for step in column), default=0)
-    progress = f"stopped or still running, at {step:,} of {total:,} steps"
-    return f"no {REPORT}: {progress}; continue with: {resume_command(path)}"
+    progress = f"stopped or still running, at {step:,} of {config.trainer.total_steps:,} steps"
+    return f"no {REPORT}: {progress}; {how_to_continue(path, config)}"
 
 
 def _version(report: Mapping[str, Any]) -> str:
