@@ -32,6 +32,7 @@ from .metric.distance import adaptive_weights as adaptive_weights
 from .metric.distance import embodiment_distance as embodiment_distance
 from .metric.distance import link_distances as link_distances
 from .metric.distance import rotation_distance as rotation_distance
+from .metric.energy_distance import energy_distance as energy_distance
 from .metric.hand import HandStates as HandStates
 from .metric.hand import HandWeights as HandWeights
 from .metric.hand import hand_distance as hand_distance

@@ -32,7 +32,8 @@ from mimic.evaluation.rollout_metrics import (
     measure_similarity,
     speed_violations,
 )
-from mimic.metric.kinematics import link_state_table
+from mimic.metric.energy_distance import energy_distance
+from mimic.metric.kinematics import LinkStates, link_state_table
 from mimic.metric.similarity import CentreLine, centre_line_table
 from mimic.motions.demonstrations import Demonstrations, concatenate, effective_rank
 from mimic.runs.files import write_csv
@@ -237,6 +238,24 @@ class Evaluator:
             baselines.pop(CONTROLLER, None)  # it is the one that was evaluated
         tables = {controller: self.similarity(np.asarray(rollouts.qpos)), **baselines}
         return means_by_split(tables, self.parts)
+
+    def energy_distance(self, rollouts: Rollouts) -> dict[str, float]:
+        """Energy distance between the ensembles of expert and learner at each step, one learner; means by split."""
+        env = self.env
+        learner_states = link_state_table(env.learner, np.asarray(rollouts.qpos), np.asarray(rollouts.qvel))
+        expert_states = jax.tree.map(lambda x: x[:, 1 : env.config.horizon + 1], env.expert_states)
+
+        def of_step(pair: tuple[LinkStates, LinkStates]) -> Array:
+            return energy_distance(env.expert, env.learner, pair[0], pair[1], env.config.metric)
+
+        @jax.jit
+        def mean(*states: LinkStates) -> Array:
+            return jnp.mean(jax.lax.map(of_step, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), states)))
+
+        def of_part(part: slice) -> float:
+            return float(mean(*(jax.tree.map(lambda x: x[part], x) for x in (expert_states, learner_states))))
+
+        return {split: of_part(part) for split, part in self.parts.items()}
 
     def table(self, rollouts: Rollouts) -> Table:
         """One row for each demonstration: gap, mean distance, bound, distance of the start pose, and `measure`'s.

@@ -149,7 +149,7 @@ def test_the_inverse_holds_on_an_accelerated_base(x64):
     torque = dynamics.inverse(joints, qpos, qvel, qacc, base)
     forward = dynamics.acceleration(dynamics.loaded(joints, 1.0, 1.0), qpos, qvel, torque, base)
     np.testing.assert_allclose(forward, qacc, rtol=1e-9)
-    assert np.abs(np.subtract(torque, dynamics.inverse(joints, qpos, qvel, qacc))).max() > 10  # weight of the arm
+    assert np.abs(np.subtract(torque, dynamics.inverse(joints, qpos, qvel, qacc))).max() > 1  # weight of the arm
 
 
 def test_damping_and_armature_enter_the_inverse(x64, batch):

@@ -237,7 +237,12 @@ class PPOTrainer(Trainer):
             "similarity": self.evaluator.similarity_summary(outcome, controller),
         }
         if not self._has_many_arms:
-            return {**details, "worst_demonstrations": self.evaluator.worst(outcome)}
+            energy_distance = self.evaluator.energy_distance(outcome)
+            return {
+                **details,
+                "energy_distance": energy_distance,
+                "worst_demonstrations": self.evaluator.worst(outcome),
+            }
         count = self.evaluator.env.demonstrations.count
         return {**details, "evaluated_demonstrations": count, "arms": self.evaluator.details(outcome)}
 
