@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.commands.config import EvaluateConfig
+from mimic.commands import retarget
+from mimic.commands.config import EvaluateConfig, RetargetConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs import env_config
 from mimic.runs.checkpoints import checkpoint_steps
@@ -107,10 +108,25 @@ def test_a_loaded_mapper_takes_one_pose_or_many(trained):
 def test_the_nearest_head_is_taken(trained):
     mapper = mimic.PoseMapper.load(trained[0])
     qpos = jnp.asarray(poses(mapper, 5)[2])
-    model = mapper.model
-    candidates = jax.jit(lambda qpos: model.candidates(mapper.params, model.pair().target(qpos)))(qpos)
+    candidates = jax.jit(mapper.candidates)(qpos)
     distances = jax.jit(jax.vmap(mapper.distance, (None, 0)))(qpos, candidates)
     np.testing.assert_allclose(jax.jit(mapper)(qpos), candidates[int(np.argmin(distances))], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_retargeted_motions_do_not_jump(learned, tmp_path):
+    mapper = mimic.PoseMapper.load(learned[0])
+    env = mimic.make("planar4dof", demonstrations={"count": 3, "held_out": 1})
+    out = tmp_path / "learner.npz"
+    env.demonstrations.save(tmp_path / "expert.npz")
+    config = RetargetConfig(str(tmp_path / "expert.npz"), env.config, str(learned[0]), out=str(out))
+    retarget.prepare_retargeting(config)()
+    motions = mimic.load_demonstrations(out)
+    motions.check_fits(env.learner, 0.1, 50)
+    assert np.all(np.abs(np.diff(motions.qpos, axis=1)) <= env.learner.velocity_limit * 0.1 + 1e-5)
+    metric, arms = env.config.metric, (env.expert, env.learner)
+    mapped, optimised = (retarget.retarget(env.demonstrations, *arms, metric, mapper=way)[1] for way in (mapper, None))
+    assert optimised["distance"] < mapped["distance"] < optimised["distance"] + 0.05
 
 
 @pytest.mark.slow
@@ -209,6 +225,9 @@ def test_a_mapper_of_other_arms_or_of_no_run_is_rejected(trained, tmp_path):
     mapper = mimic.PoseMapper.load(trained[0])
     with pytest.raises(ValueError, match="learner: expected none, because this mapper has a fixed one, planar2"):
         mapper.to("panda")
+    mapper.check_fits(mapper.expert, mapper.learner)
+    with pytest.raises(ValueError, match="its learner is planar2"):
+        mapper.check_fits(mapper.expert, mimic.panda())
     with pytest.raises(ValueError, match="not a run directory"):
         mimic.PoseMapper.load(tmp_path)
     (tmp_path / "config.yaml").write_text("trainer: {name: ppo}\n")

@@ -149,6 +149,10 @@ class PoseMapper:
     def _target(self, qpos: Float[Array, " joints"]) -> Target:
         return self.model.pair(self._learner.data, self._expert.data).target(self._expert.in_slots(qpos))
 
+    def candidates(self, qpos: Float[Array, " joints"]) -> Float[Array, "poses learner_joints"]:
+        """The poses among which the mapper chooses the nearest [rad]; of one pose of the expert."""
+        return self._learner.own_joints(self.model.improved(self.params, self._target(qpos)))
+
     def nearest(self, qpos: Float[Array, " joints"]) -> Float[Array, " learner_joints"]:
         """What a call returns for one pose of the expert [rad], without checks."""
         return self._learner.own_joints(self.model(self.params, self._target(qpos)))
@@ -184,6 +188,15 @@ class PoseMapper:
         """
         expert_arm = self.expert_arm if expert is None else self._described(expert, "expert")
         return dataclasses.replace(self, expert_arm=expert_arm, learner_arm=self._described(learner, "learner"))
+
+    def check_fits(self, expert: Embodiment, learner: Embodiment) -> None:
+        """Raises a ValueError unless the mapper maps poses of this expert to poses of this learner."""
+        for role, arm, own in (("expert", expert, self.expert), ("learner", learner, self.learner)):
+            if (arm.name, arm.joint_names) != (own.name, own.joint_names):
+                raise ValueError(
+                    f"mapper: its {role} is {own.name} with joints {', '.join(own.joint_names)}, "
+                    f"expected {arm.name} with joints {', '.join(arm.joint_names)}"
+                )
 
 
 AnyArmMapper = PoseMapper  # in `mimic.__all__`: a mapper that takes any learner
