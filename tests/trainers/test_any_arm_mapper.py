@@ -23,6 +23,7 @@ from mimic.trainers import run_training as session
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper import training
 from mimic.trainers.pose_mapper.evaluation import METHODS, Mapped, Reference, best_poses, table_of_pairs
+from mimic.trainers.pose_mapper.mapper import load_mapper
 from mimic.trainers.pose_mapper.mapper_arm import describe_arm
 from mimic.trainers.pose_mapper.model import make_model
 from mimic.trainers.pose_mapper.pair import random_poses
@@ -401,7 +402,9 @@ def test_bad_arms_and_poses_are_rejected(mapper):
             mapper(*arguments)
 
 
-def test_a_mapper_to_any_arm_has_no_learner(mapper):
+def test_a_mapper_is_loaded_for_the_arms_of_its_environment_or_others(runs, mapper):
+    assert load_mapper(runs["drawn"], expert=FOUR).expert.num_joints == 4
+    assert load_mapper(runs["fixed"]).learner.num_joints == 7
     assert mapper.takes_any_learner and mimic.AnyArmMapper.load is not None
     with pytest.raises(ValueError, match="learner: expected an arm"):
         _ = mapper.learner

@@ -14,7 +14,7 @@ from mimic.base.distribution import VERSION
 from mimic.envs.imitation import layout_of, observation_layout, torque_scale
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.pose_mapper.mapper import PoseMapper
+from mimic.trainers.pose_mapper.mapper import load_mapper
 from mimic.trainers.pose_mapper.mapper_arm import NamedArm
 from mimic.trainers.ppo import ppo
 from mimic.trainers.ppo.trainer import run_environment
@@ -46,7 +46,7 @@ def make_function(trained: TrainConfig, run_dir: Path, steps: int, learner: Name
       trained: config of the run.
       run_dir: run directory.
       steps: of the checkpoint, which exists.
-      learner: of a mapper to any arm; that of its environment where None.
+      learner: of a mapper to any arm; see `load_mapper`.
 
     Raises:
       ValueError: a learner that the mapper does not take.
@@ -94,9 +94,7 @@ def _policy(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFunction
 
 def _mapper(run_dir: Path, steps: int, learner: NamedArm | None) -> ExportedFunction:
     """A pose mapper to one arm, whether it was trained for that one or takes any."""
-    mapper = PoseMapper.load(run_dir, steps)
-    if mapper.takes_any_learner:
-        mapper = mapper.to(learner or mapper.env.learner)
+    mapper = load_mapper(run_dir, steps, learner)
 
     def function(expert_qpos: jax.Array) -> dict[str, jax.Array]:
         return {"learner_qpos": mapper.nearest(expert_qpos)}

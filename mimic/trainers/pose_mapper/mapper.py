@@ -202,6 +202,29 @@ class PoseMapper:
 AnyArmMapper = PoseMapper  # in `mimic.__all__`: a mapper that takes any learner
 
 
+def load_mapper(
+    run_dir: str | os.PathLike[str],
+    checkpoint: int | None = None,
+    learner: NamedArm | None = None,
+    expert: NamedArm | None = None,
+) -> PoseMapper:
+    """The mapper of a run to one learner, whether the run trained for that one or for any arm.
+
+    Args:
+      run_dir: the run directory.
+      checkpoint: number of training poses of the checkpoint; the last checkpoint where None.
+      learner: arm to map to, where the run draws its learners; default: the learner of its environment.
+      expert: arm of the poses, where the run draws its experts; default: the expert of its environment.
+
+    Raises:
+      ValueError: see `PoseMapper.load`.
+    """
+    mapper = PoseMapper.load(run_dir, checkpoint)
+    if not mapper.takes_any_learner:
+        return mapper
+    return mapper.to(learner or mapper.env.learner, expert if mapper.model.takes_any_expert else None)
+
+
 def _one_arm(arm: ArmArrays, role: str) -> MapperArm:
     """An arm as arrays in single precision, whose own joints are all slots.
 
