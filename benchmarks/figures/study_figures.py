@@ -1,4 +1,4 @@
-"""Figures of `benchmarks.dynamic_imitation`."""
+"""Figures of `benchmarks.study`."""
 
 from pathlib import Path
 

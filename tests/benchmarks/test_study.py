@@ -1,11 +1,11 @@
-"""The study of dynamic imitation asks for what the commands take."""
+"""The study asks for what the commands take."""
 
 from pathlib import Path
 
 import hydra
 import pytest
 
-from benchmarks import dynamic_imitation as study
+from benchmarks import study
 from mimic.commands import cli
 from mimic.metric.config import MetricConfig
 
@@ -37,6 +37,20 @@ def test_every_run_and_evaluation_has_arguments_that_the_commands_take(preset, c
         run = Path(config.run)
         assert (config.out, run.parent.name) == (str(out), out.parent.name.partition("--")[0])
         assert any(case.name == run.parent.name and int(run.name) < case.seeds for case in cases)
+
+
+def test_a_group_is_measured_once_all_of_its_runs_are_there(tmp_path):
+    chosen = [case for case in study.cases("quick") if case.group == "unknown"]
+    out = tmp_path / "study_cpu.json"
+    assert study.measurements(chosen, tmp_path, out, 1) == {}
+    for case in chosen:
+        (tmp_path / case.name / "0").mkdir(parents=True)
+        (tmp_path / case.name / "0" / "report.json").touch()
+    ((results, command),) = study.measurements(chosen, tmp_path, out, 1).items()
+    assert results == tmp_path / "unknown_cpu.json" and command[1:3] == ["-m", "benchmarks.unknown"]
+    assert command[-2:] == [str(tmp_path / case.name / "0") for case in chosen]
+    results.touch()
+    assert study.measurements(chosen, tmp_path, out, 1) == {}
 
 
 def test_the_sweep_locks_every_joint_and_every_pair():

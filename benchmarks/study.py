@@ -1,10 +1,11 @@
-"""The paper's dynamic motion imitation and experiments beyond it: all numbers of docs/dynamic_imitation.md.
+"""The study of all policies: those of the default settings, of unknown arms, by brax's loop, and of the paper.
 
-    python -m benchmarks.dynamic_imitation --runs DIR --out FILE [--preset paper] [--only GROUP ...] [--jobs N]
+    python -m benchmarks.study --runs DIR --out FILE [--preset paper] [--only GROUP ...] [--jobs N]
 
 Trains each case by `python -m mimic.train -m` over its seeds, and evaluates runs by `python -m mimic.evaluate`, several
-in parallel. What DIR contains is not repeated, so that an interrupted study can be continued. Prints the table of
-`python -m mimic.collect DIR`, writes a results file, and figures next to it.
+in parallel. Then `benchmarks.motions` and `benchmarks.unknown` measure the groups "policies" and "unknown", each into a
+results file next to FILE. What DIR contains is not repeated, so that an interrupted study can be continued. Prints the
+table of `python -m mimic.collect DIR`, writes a results file, and figures next to it.
 """
 
 import csv
@@ -57,10 +58,9 @@ class Case(NamedTuple):
 def cases(preset: str) -> list[Case]:
     extent = STUDY["presets"][preset]
     return [
-        Case(
-            group, name.format(**values), f"{extent['arguments']} {arguments}".format(**extent, **values).split(), seeds
-        )
+        Case(group, name.format(**values), f"{settings} {arguments}".format(**extent, **values).split(), seeds)
         for group, named in STUDY["cases"].items()
+        for settings in [extent["mixed" if group in STUDY["mixed"] else "arguments"]]
         for seeds in [extent["seeds"] if group in STUDY["several_seeds"] else 1]
         for name, arguments in named.items()
         for values in _values(name)
@@ -116,6 +116,20 @@ def run(chosen: Sequence[Case], folder: Path, jobs: int) -> list[Path]:
     return failed + run_parallel(commands, jobs=jobs, devices=devices)
 
 
+def measurements(chosen: Sequence[Case], folder: Path, out: Path, count: int) -> dict[Path, list[str]]:
+    """Commands that measure all runs of a group, by their new results files next to that of the study."""
+    commands = {}
+    for name, (group, arguments) in STUDY["measurements"].items():
+        runs = [
+            str(folder / case.name / str(seed)) for case in chosen if case.group == group for seed in range(case.seeds)
+        ]
+        results = out.with_name(f"{name}_{out.stem.rpartition('_')[2]}.json")
+        if cases and all(case.done(folder) for case in cases) and not results.is_file():
+            options = *arguments.split(), "--count", str(count), "--out", str(results), "--runs", *runs
+            commands[results] = [sys.executable, "-m", f"benchmarks.{name}", *options]
+    return commands
+
+
 def collect(folder: Path) -> dict[str, list[Row]]:
     """The reports by case: `NAME` of the runs, `NAME--KIND` of their evaluations; a list over seeds."""
     results = defaultdict(list)
@@ -138,13 +152,17 @@ def collect(folder: Path) -> dict[str, list[Row]]:
 
 def main() -> None:
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # the GPU is for the runs
-    parser = make_parser("dynamic_imitation", __doc__, only=STUDY["cases"], jobs=2, collect=False)
+    parser = make_parser("study", __doc__, only=STUDY["cases"], jobs=2, collect=False)
     parser.add_argument("--runs", type=Path, required=True, metavar="DIR", help="folder of the runs")
     parser.add_argument("--preset", choices=STUDY["presets"], default="paper")
     options = parser.parse_args()
     chosen = [case for case in cases(options.preset) if case.group in options.only]
     options.runs.mkdir(parents=True, exist_ok=True)
     failed = [] if options.collect else run(chosen, options.runs, options.jobs)
+    if options.out and not options.collect:
+        commands = measurements(chosen, options.runs, options.out, STUDY["presets"][options.preset]["count"])
+        logs = {options.runs / "logs" / f"{results.stem}.log": command for results, command in commands.items()}
+        failed += run_parallel(logs, jobs=1, devices=jax.device_count() if jax.default_backend() == "gpu" else 0)
     os.environ.setdefault("COLUMNS", str(WIDTH))  # also without a terminal
     prepare_collection(CollectConfig(str(options.runs)))()
     results = collect(options.runs)
