@@ -120,11 +120,10 @@ def measurements(chosen: Sequence[Case], folder: Path, out: Path, count: int) ->
     """Commands that measure all runs of a group, by their new results files next to that of the study."""
     commands = {}
     for name, (group, arguments) in STUDY["measurements"].items():
-        runs = [
-            str(folder / case.name / str(seed)) for case in chosen if case.group == group for seed in range(case.seeds)
-        ]
+        cases_of_group = [case for case in chosen if case.group == group]
+        runs = [str(folder / case.name / str(seed)) for case in cases_of_group for seed in range(case.seeds)]
         results = out.with_name(f"{name}_{out.stem.rpartition('_')[2]}.json")
-        if cases and all(case.done(folder) for case in cases) and not results.is_file():
+        if runs and all(case.done(folder) for case in cases_of_group) and not results.is_file():
             options = *arguments.split(), "--count", str(count), "--out", str(results), "--runs", *runs
             commands[results] = [sys.executable, "-m", f"benchmarks.{name}", *options]
     return commands

@@ -147,7 +147,7 @@ class ImitationEnv(Env):
         self.demonstrations = demonstrations
         # Computed once: `step` only looks them up.
         table = link_state_table(self.expert, demonstrations.qpos, demonstrations.qvel)
-        self.expert_states: LinkStates = jax.tree.map(jnp.asarray, table)
+        self.expert_states: LinkStates = jax.device_put(table)
         self.start_poses = self._start_poses_of(demonstrations)
 
     def _start_poses_of(self, demonstrations: Demonstrations) -> Float[np.ndarray, "demonstrations joints"]:

@@ -243,7 +243,7 @@ class Evaluator:
         """Energy distance between the ensembles of expert and learner at each step, one learner; means by split."""
         env = self.env
         learner_states = link_state_table(env.learner, np.asarray(rollouts.qpos), np.asarray(rollouts.qvel))
-        expert_states = jax.tree.map(lambda x: x[:, 1 : env.config.horizon + 1], env.expert_states)
+        expert_states = jax.tree.map(lambda x: x[:, 1 : env.config.horizon + 1], jax.device_get(env.expert_states))
 
         def of_step(pair: tuple[LinkStates, LinkStates]) -> Array:
             return energy_distance(env.expert, env.learner, pair[0], pair[1], env.config.metric)

@@ -82,7 +82,7 @@ def test_a_training_on_a_clip_keeps_the_learner(world):
 def test_a_printed_resume_continues_its_run(tmp_path, capsys):
     """That of a training that stops, and that of `collect` for a run without a report."""
     run_dir = write_run(tmp_path / "it's a run", [0.5], "panda3dof", report=False)
-    _stopped(Console(), run_dir, OSError("the disk is full"))
+    _stopped(Console(), run_dir, load_config(run_dir), OSError("the disk is full"))
     _, (left_out,) = find_runs(tmp_path)
     for line in (capsys.readouterr().err, left_out.reason):
         python, module, command, *words = shlex.split(line.partition("continue with: ")[2])

@@ -183,6 +183,7 @@ def test_a_report_explains_a_missing_gap(evaluator, monkeypatch):
     monkeypatch.setattr(Evaluator, "lower_bound", property(lambda evaluator: 0.9 * evaluator.hold_distance))
     ran = rollouts(evaluator, distance=2 * evaluator.hold_distance)
     figures = {**evaluator.summary(ran), "worst_demonstrations": evaluator.worst(ran)}
+    figures["energy_distance"] = {"train": 0.1, "held_out": 0.2}
     assert all(np.isnan(gap) for gap in figures["optimality_gap"].values())
     assert figures["worst_demonstrations"] == {"train": {}, "held_out": {}}
     rows = PPOTrainer.rows(object.__new__(PPOTrainer), figures)
