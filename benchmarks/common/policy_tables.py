@@ -38,16 +38,6 @@ def pose_methods(pose: Results) -> list[Cells]:
     return rows
 
 
-def mapper_times(mapper: Results) -> list[Cells]:
-    rows: list[Cells] = [("pair", "training", "unseen", "within 2 % of the optimiser after", "training", "poses/s")]
-    for env, pair in ENVIRONMENTS.items():
-        run = next(run for run in mapper["runs"] if run["report"]["env"] == env)
-        quality, seconds = run["report"]["quality"], run["report"]["wall_time_s"]["train"]
-        cells = percent(quality["train"]), percent(quality["held_out"]), f"{run['to_goal_s']:.1f} s", f"{seconds:.1f} s"
-        rows.append((f"Panda {pair}", *cells, large(run["poses_per_second"])))
-    return rows
-
-
 def mapper_presets(mapper: Results) -> list[Cells]:
     pairs = {env: f"Panda {pair}" for env, pair in ENVIRONMENTS.items()}
     pairs |= {"planar4dof": "planar 7 to 4", "planar7dof": "planar 4 to 7"}
@@ -56,37 +46,6 @@ def mapper_presets(mapper: Results) -> list[Cells]:
     for env, pair in pairs.items():
         paper, wide = reports["paper", env], reports["large", env]
         rows.append((pair, percent(paper["train"]), percent(paper["held_out"]), percent(wide["held_out"])))
-    return rows
-
-
-def costs(results: Results) -> list[Cells]:
-    columns = {
-        "centre line": ("centre_line_distance", ".3f"),
-        "hand position": ("hand_position_error", ".3f"),
-        "hand angle [deg]": ("hand_angle_deg", ".0f"),
-    }
-    effects = {
-        "home": ("from_home", "distance from home", ".2f"),
-        "limits": ("at_limits", "intrusion at limits", ".3f"),
-        "velocity": ("step_rms", "change in a step [rad]", ".3f"),
-        "acceleration": ("change_rms", "change of it [rad]", ".3f"),
-        "self_collision": ("self_collisions", "poses in self-collision", ".1%"),
-        "floor": ("below_floor", "poses below the floor", ".1%"),
-    }
-    kinds = tuple(dict.fromkeys(row["motions"] for row in results["rows"]))  # demonstrations, random motions
-
-    def both(cost: str, key: str, form: str) -> str:
-        pair = [one(results["rows"], cost=cost, motions=kind) for kind in kinds]
-        return " / ".join(format({**row, **row["similarity"]}[key], form) for row in pair)
-
-    rows: list[Cells] = [("cost", *columns, "what it is for: without -> with")]
-    for cost, weights in results["weights"].items():
-        name = f"`{cost}={weights[cost]:g}`" if cost in weights else "all of them" if weights else "none"
-        effect = ""
-        if cost in effects:
-            key, what, form = effects[cost]
-            effect = f"{what}: {both('none', key, form)} -> {both(cost, key, form)}"
-        rows.append((name, *(both(cost, key, form) for key, form in columns.values()), effect))
     return rows
 
 
