@@ -228,10 +228,10 @@ def _words(numbers: np.ndarray) -> str:
 
 def followed_by_pyroki(arm: Embodiment, targets: np.ndarray, start: np.ndarray) -> np.ndarray:
     """PyRoki's least squares from the last pose at each time, with the weights of its examples."""
-    import jaxlie
-    import jaxls
-    import pyroki
-    import yourdfpy
+    import jaxlie  # pyright: ignore[reportMissingImports]
+    import jaxls  # pyright: ignore[reportMissingImports]
+    import pyroki  # pyright: ignore[reportMissingImports]
+    import yourdfpy  # pyright: ignore[reportMissingImports]
 
     robot = pyroki.Robot.from_urdf(yourdfpy.URDF.load(io.StringIO(urdf(arm))))
     link, joints = jax.numpy.array(robot.links.names.index("hand")), robot.joint_var_cls(0)

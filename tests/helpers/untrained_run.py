@@ -54,7 +54,7 @@ def untrained_run(folder: Path, env: EnvConfig | None = None, **settings: Any) -
     save_config(folder, dataclasses.replace(config, env=trainer.env_config, trainer=trainer.settings))
     trainer.save_inputs(folder)
     env = trainer.evaluator.env
-    networks = make_networks(trainer.settings, env.observation_size, env.action_size)
+    networks = make_networks(trainer.settings, env.observation_size, env.action_size, env.privileged_size)
     initial = jax.jit(lambda key: initial_params(networks, env.observation_size, key))
     save_checkpoint(folder, 0, initial(jax.random.PRNGKey(2)))  # a policy without jumps
     return folder

@@ -30,7 +30,7 @@ class Case:
     keys: jax.Array
 
     def __post_init__(self):
-        env: Any = SimpleNamespace(observation_size=OBSERVED, action_size=ACTIONS)
+        env: Any = SimpleNamespace(observation_size=OBSERVED, action_size=ACTIONS, privileged_size=1)
         # With an epsilon of this size Adam's steps depend on the size of the gradient.
         self.optimizer = optax.adam(optax.constant_schedule(0.01), eps=0.1)
         self.setup = ppo.make_setup(env, self.config, DEVICES)._replace(optimizer=self.optimizer)
@@ -79,7 +79,7 @@ def case(x64):
         return jnp.asarray(rng.normal(size=(DEVICES, UNROLLS, TIME + 1, *shape)))
 
     goes_on = jnp.asarray(rng.random((DEVICES, UNROLLS, TIME + 1)) < 0.8, float)
-    unrolls = ppo.Unrolls(normal(OBSERVED), normal(ACTIONS), normal() - 3, normal(), goes_on, normal())
+    unrolls = ppo.Unrolls(normal(OBSERVED), normal(ACTIONS), normal(1), normal() - 3, normal(), goes_on)
     order = jnp.asarray([[rng.permutation(UNROLLS)[:MINIBATCH] for _ in range(UPDATES)] for _ in range(DEVICES)])
     config = dataclasses.replace(PPOConfig(hidden_layers=[8, 4]).resolve("cpu"), max_grad_norm=LIMIT)
     return Case(config, unrolls, order, jax.random.split(jax.random.PRNGKey(2), DEVICES))
