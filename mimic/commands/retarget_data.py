@@ -41,7 +41,7 @@ _POSITION_ALONE = 0.5  # of the frames that fail: with so many whose hand is at 
 
 
 class _Setting(NamedTuple):
-    """What all episodes of a data set share."""
+    """What all episodes of a data set share; `openings` are the learner's, by entry and episode."""
 
     expert: Embodiment
     learner: Embodiment
@@ -51,6 +51,7 @@ class _Setting(NamedTuple):
     dt: float
     seed: int
     grippers: tuple[GripperRange | None, GripperRange | None]
+    openings: Mapping[str, Mapping[str, np.ndarray | None]]
     costs: Any
     capsules: Capsules | None
     contacts: Callable[..., Any] | None
@@ -73,10 +74,10 @@ def prepare_data_set(config: RetargetConfig) -> Callable[[], int]:
         rate=config.rate, joint_range=expert.joint_range,
     )  # fmt: skip
     dt = float(np.median(np.concatenate([np.diff(motion.time) for motion in data.measured.values()])))
+    grippers = (gripper_range(env.expert), gripper_range(env.learner)) if data.grippers else (None, None)
     setting = _Setting(
-        expert, learner, env.metric, config.hand, config.placement, dt, config.seed,
-        (gripper_range(env.expert), gripper_range(env.learner)) if data.grippers else (None, None), config.costs,
-        *_shapes(env.learner, env.limits),
+        expert, learner, env.metric, config.hand, config.placement, dt, config.seed, grippers,
+        mapped_grippers(data, grippers), config.costs, *_shapes(env.learner, env.limits),
     )  # fmt: skip
 
     def run() -> int:
@@ -147,7 +148,7 @@ def _retarget_from(data: DataSet, name: str, setting: _Setting) -> tuple[dict[st
     for index, entry in enumerate(data.motions):
         qpos = path[index * count : (index + 1) * count][:: (-1) ** index]
         qvel = np.gradient(qpos, measured.time, axis=0)
-        found[entry] = Motion(measured.time, qpos, qvel, mapped_gripper(data, entry, name, setting))
+        found[entry] = Motion(measured.time, qpos, qvel, setting.openings[entry][name])
     certificate = certify(
         setting.expert, setting.learner, measured.qpos, found[data.entry].qpos, jump,
         base=setting.base, capsules=setting.capsules, contacts=setting.contacts, demands_hand=setting.hand == "exact",
@@ -155,16 +156,20 @@ def _retarget_from(data: DataSet, name: str, setting: _Setting) -> tuple[dict[st
     return found, certificate
 
 
-def mapped_gripper(data: DataSet, entry: str, name: str, setting: _Setting) -> np.ndarray | None:
-    """The gripper's values of an episode, as those of the learner's gripper where its range is another."""
-    own, every = data.motions[entry][name].gripper, [motion.gripper for motion in data.motions[entry].values()]
-    if own is None or any(gripper is None for gripper in every):
-        return own
-    mapped = other_gripper(np.concatenate(every), *setting.grippers)  # type: ignore[arg-type]
-    if mapped is None:
-        return own
-    ends = np.cumsum([len(gripper) for gripper in every])  # type: ignore[arg-type]
-    return np.split(mapped, ends[:-1])[list(data.motions[entry]).index(name)]
+def mapped_grippers(
+    data: DataSet, grippers: tuple[GripperRange | None, GripperRange | None]
+) -> dict[str, dict[str, np.ndarray | None]]:
+    """The gripper's values by entry and episode, as those of the learner's gripper where its range is another."""
+    openings = {}
+    for entry, motions in data.motions.items():
+        own: list[Any] = [motion.gripper for motion in motions.values()]
+        if all(gripper is not None for gripper in own):
+            (name, *_) = data.grippers.get(entry, ("", ()))[1] or ("",)
+            mapped = other_gripper(np.concatenate(own), *grippers, name)
+            if mapped is not None:
+                own = np.split(mapped, np.cumsum([len(gripper) for gripper in own])[:-1])
+        openings[entry] = dict(zip(motions, own, strict=True))
+    return openings
 
 
 def _shapes(arm: ArmConfig, limits: str) -> tuple[Capsules, Callable[..., Any]] | tuple[None, None]:
@@ -267,7 +272,7 @@ def _gripper_line(data: DataSet, setting: _Setting) -> str:
         return "gripper: none"
     name, motion = next(iter(data.measured.items()))
     expert, learner = setting.grippers
-    if expert is None or learner is None or mapped_gripper(data, data.entry, name, setting) is motion.gripper:
+    if expert is None or learner is None or setting.openings[data.entry][name] is motion.gripper:
         return f"gripper, as in the source: {', '.join(data.gripper)}"
     ends = (
         f"{', '.join(f'{x:.3g}' for x in end)}"

@@ -32,6 +32,7 @@ from mimic.evaluation.rollout_metrics import (
     measure_similarity,
     speed_violations,
 )
+from mimic.metric.config import CORRESPONDENCES
 from mimic.metric.energy_distance import energy_distance
 from mimic.metric.kinematics import LinkStates, link_state_table
 from mimic.metric.similarity import CentreLine, centre_line_table
@@ -240,8 +241,13 @@ class Evaluator:
         return means_by_split(tables, self.parts)
 
     def energy_distance(self, rollouts: Rollouts) -> dict[str, float]:
-        """Energy distance between the ensembles of expert and learner at each step, one learner; means by split."""
+        """Energy distance between the ensembles of expert and learner at each step, one learner; means by split.
+
+        Empty with a registered correspondence, which may know the pair alone and no arm beside itself.
+        """
         env = self.env
+        if env.config.metric.correspondence not in CORRESPONDENCES:
+            return {}
         learner_states = link_state_table(env.learner, np.asarray(rollouts.qpos), np.asarray(rollouts.qvel))
         expert_states = jax.tree.map(lambda x: x[:, 1 : env.config.horizon + 1], jax.device_get(env.expert_states))
 

@@ -44,4 +44,4 @@ def _mean_distance(metric: Metric, a: LinkStates, b: LinkStates) -> Float[Array,
     def of_sample(state: LinkStates) -> Array:
         return metric(jax.tree.map(lambda x: x[None], state), b).mean()
 
-    return jnp.mean(jax.vmap(of_sample)(a))
+    return jnp.mean(jax.lax.map(of_sample, a))  # a row at a time: all pairs at once take 4 KB each

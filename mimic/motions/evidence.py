@@ -32,7 +32,7 @@ class Evidence(NamedTuple):
       errors: function from [candidates, rows, joints] to errors [candidates, parts]; parts are joints, or one.
       tolerance: of errors.
       unit: of errors, in messages.
-      has_zeros: whether a shifted zero changes the errors.
+      has_zeros: whether shifted zeros are tried as the cause.
       is_weak: whether it counts only where nothing else is wrong.
     """
 

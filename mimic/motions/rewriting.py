@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.motions.cleaning import OVERSHOOT, Notes, cleaned
+from mimic.motions.cleaning import FULL_TURN, OVERSHOOT, Notes, cleaned
 from mimic.motions.doubts import doubts
 from mimic.motions.formats.episodes import Motion, Recording
 from mimic.motions.formats.hdf5 import is_hdf5
@@ -98,7 +98,8 @@ def read_data_set(
     for name in recording.commanded:
         found = in_rad(recordings[name], unit, ranges).motions
         every[name] = {episode: _near(found[episode], motion) for episode, motion in motions.items()}
-    raw = {name: in_rad(recording, unit, ranges).motions[name] for name in motions}
+    stated = in_rad(recording, unit, ranges).motions  # with velocities that `cleaned` drops
+    raw = {name: stated[name]._replace(qpos=motion.qpos) for name, motion in motions.items()}
     suspicious = [
         _beyond(motions, arm.joint_names, ranges),
         *doubts(arm, raw, {name: every[name] for name in recording.commanded}, recording.joints),
@@ -118,7 +119,7 @@ def _whole(recording: Recording, arm: Embodiment) -> tuple[dict[str, Motion], di
         except ValueError as error:
             faults[name] = str(error).removeprefix("source: ")
             continue
-        if len(parts) == 1 and len(parts[0].time) == len(motion.time):
+        if len(parts) == 1 and np.array_equal(parts[0].time, motion.time):
             motions[name] = parts[0]
         else:
             faults[name] = "; ".join(notes.lines())
@@ -130,6 +131,7 @@ def _beyond(motions: Mapping[str, Motion], names: Sequence[str], ranges: np.ndar
     low, high = (extreme([extreme(motion.qpos, axis=0) for motion in motions.values()], axis=0)
                  for extreme in (np.min, np.max))  # fmt: skip
     beyond = np.maximum(ranges[:, 0] - low, high - ranges[:, 1])
+    beyond[np.ptp(ranges, axis=1) >= FULL_TURN] = -np.inf  # joints that turn on
     joint = int(np.argmax(beyond))
     text = f"{names[joint]} is up to {beyond[joint]:.2g} rad beyond the range of the expert's model"
     if beyond[joint] > _FAR_BEYOND:
@@ -190,7 +192,7 @@ def write_data_set(
             [motions[entry][name].qpos for name in kept]
         )
     if data.gripper:
-        arrays["gripper"] = np.concatenate([data.measured[name].gripper for name in kept])  # type: ignore[misc]
+        arrays["gripper"] = np.concatenate([motion.gripper for motion in chosen])  # type: ignore[misc]
         arrays["gripper_names"] = np.array(data.gripper)
     np.savez_compressed(out / "motions.npz", **arrays)  # pyright: ignore[reportArgumentType]
     return [

@@ -88,7 +88,7 @@ def spread_poses(
 ) -> Float[np.ndarray, "count joints"]:
     """The poses whose hands are farthest from each other, so that none is far from one of them.
 
-    Each next pose is the one with the greatest distance of its hand from those before, a metre counting as a radian.
+    Each next pose is the one with the greatest distance of its hand from those before, a metre counting as 1.4 radians.
     """
     hands = jax.device_get(jax.jit(jax.vmap(lambda pose: hand_frames(arm, pose)))(qpos))
     places = np.concatenate([hands.position.reshape(len(qpos), -1), hands.rotation.reshape(len(qpos), -1) / 2], axis=1)

@@ -352,7 +352,7 @@ class _Samples:
         self.reason = ""
         if qpos is None:
             return None
-        sample = np.asarray(qpos, float)
+        sample = np.array(qpos, float)  # a copy: drivers use their buffers again
         if sample.shape != (self._joints,):
             raise ValueError(f"leader_qpos: expected {self._joints} angles [rad], got shape {sample.shape}")
         if not math.isfinite(sample.dot(sample)) or (time is not None and not math.isfinite(time)):
@@ -367,7 +367,9 @@ class _Samples:
         return None
 
     def _is_old(self, time: float) -> bool:
-        self._backwards = self._backwards + self._period if time <= self._newest else 0.0
+        if time == self._newest:
+            return True  # the same sample again, however long
+        self._backwards = self._backwards + self._period if time < self._newest else 0.0
         if 0 < self._backwards <= _PATIENCE:
             return True
         self._newest, self._backwards = time, 0.0

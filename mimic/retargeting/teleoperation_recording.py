@@ -38,7 +38,7 @@ class TeleoperationRecorder:
         self.operator = operator
         frames_per_second(operator.period)
         self._episodes: list[list[_Tick]] = []
-        self._engagement, self._last, self._opening = -1, None, np.nan
+        self._engagement, self._opening = -1, np.nan
 
     @property
     def episodes(self) -> int:
@@ -56,6 +56,10 @@ class TeleoperationRecorder:
         """
         operator = self.operator
         before = operator.qpos if measured is None else np.array(measured, float)
+        if before.shape != operator.qpos.shape or not np.isfinite(before).all():
+            raise ValueError(
+                f"measured: expected {operator.follower.num_joints} finite angles [rad], got {measured!r:.80}"
+            )
         command = operator.step(leader_qpos, gripper, time)
         opening = np.nan if command.gripper is None else command.gripper
         if operator.is_engaged and operator.leader_qpos is not None:

@@ -112,7 +112,7 @@ def test_an_episode_of_which_few_frames_fail_is_searched_again(monkeypatch, fail
         return setting.seed, Certificate(none, none, none, none, none, causes)
 
     monkeypatch.setattr(retarget_data, "_retarget_from", of_seed)
-    setting = retarget_data._Setting(*[None] * 6, 0, *[None] * 4)  # type: ignore[arg-type]
+    setting = retarget_data._Setting(*[None] * 6, 0, *[None] * 5)  # type: ignore[arg-type]
     found, certificate = retarget_data.retarget_episode(None, "", setting)  # type: ignore[arg-type]
     assert found == chosen
     assert sum(map(bool, certificate.causes)) == failing[chosen]

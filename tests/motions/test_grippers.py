@@ -72,6 +72,17 @@ def test_the_fraction_of_the_range_stays(values, expert, learner, expected):
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
+def test_one_named_joint_of_several_is_no_width():
+    """A driver of 0.8 rad when closed is no opening; without a name it may be one or the other."""
+    driver = GripperRange(("left_driver", "right_driver"), np.array([0.8, 0.8]), np.zeros(2))
+    for expert, closed, opened in ((driver, 0.8, 0.0), (SLIDES, SLIDES.closed[0], SLIDES.opened[0])):
+        values = closed + FRACTION * (opened - closed)
+        found = other_gripper(values, expert, JAW, f"robot0_{expert.names[0]}")
+        assert found is not None
+        np.testing.assert_allclose(found, -0.2 + 2 * FRACTION, atol=1e-12)
+    assert other_gripper(0.8 - 0.8 * FRACTION, driver, JAW) is None
+
+
 @pytest.mark.parametrize("kind", ["csv", "hdf5"])
 def test_it_is_written_in_the_columns_of_the_source(tmp_path, kind):
     (tmp_path / "in").mkdir()

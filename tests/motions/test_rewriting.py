@@ -52,6 +52,7 @@ def rewrite(tmp_path, source, kept=None, **options):
         (["time", "q_1", "q_2", "dq_1", "dq_2"], ["1", "2"], ["time", "q_1", "q_2", "q_3", "dq_1", "dq_2", "dq_3"]),
         (["actual_q_0", "actual_q_1"], ["actual 0", "actual 1"], ["actual_q_0", "actual_q_1", "actual_q_2"]),
         (["/js/joint1/position", "/js/joint2/position"], ["/js/joint1", "/js/joint2"], ["l1/position"]),
+        ([*map(str, range(1, 13))], ["1", "2"], [*map(str, [1, 2, 3, *range(3, 13)])]),
         (["a [deg]", "b [deg]", "tau_a", "tau_b"], ["a", "b"], ["l1 [deg]", "l2 [deg]", "l3 [deg]"]),
     ],
 )  # fmt: skip

@@ -167,6 +167,24 @@ def test_time_that_runs_backwards_is_ignored_then_accepted(arms):
     assert_within_limits(operator, np.array([command.qpos for command in commands]))
 
 
+def test_a_sample_that_is_repeated_is_none(arms):
+    """A driver that has died may send its last sample, with its stamp, for ever."""
+    operator = mimic.Teleoperator(*arms, hand="relative", rate=RATE)
+    operator.engage()
+    commands = [operator.step(sample, time=n / RATE) for n, sample in enumerate(sway(50))]
+    commands += [operator.step(READY, time=49 / RATE) for _ in range(40)]
+    assert commands[49].status.state != "holding" and commands[-1].status.state == "holding"
+
+
+def test_a_buffer_may_be_used_again(arms):
+    operator = mimic.Teleoperator(*arms, hand="relative", rate=RATE)
+    operator.engage()
+    buffer = READY.copy()
+    operator.step(buffer)
+    buffer += 2.0
+    assert "jump" in operator.step(buffer).status.reason
+
+
 def test_hand_out_of_reach_ends_at_the_nearest(arms):
     operator = mimic.Teleoperator(*arms, base=[-1.0, 0, 0, 0], rate=RATE)  # the hand is 1.3 m away
     operator.engage()

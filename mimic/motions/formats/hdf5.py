@@ -154,7 +154,7 @@ def _motion(episode: Episode, layout: _Layout | None, selection: Selection, rate
         at = layout.qpos if selection.gripper_entry == STATES and layout else None
         gripper = channels[:, [at[name] if at else int(name) - 1 for name in selection.gripper]]
     numbered = {name: [str(column) for column in range(1, width + 1)] for name, width in _widths(episode)}
-    found = hand_position(numbered)
+    found = hand_position({name: columns for name, columns in numbered.items() if len(episode.sets[name]) == len(qpos)})
     hand = _columns(episode.sets[found[0]])[:, :3] if found else None
     return Motion(_times(episode, len(qpos), layout, rate), qpos, qvel, gripper, hand, _hand_steps(episode, len(qpos)))
 
@@ -174,12 +174,19 @@ def step_controller(episode: Episode) -> Mapping[str, Any]:
     """The settings of robosuite's controller whose actions are steps of the hand; empty without one."""
     for attributes in episode.attributes:
         for key in _ENVIRONMENTS:
-            content = json.loads(_text(attributes[key])) if key in attributes else None
-            for settings in _mappings(content):
+            for settings in _mappings(_json(attributes.get(key))):
                 is_delta = settings.get("control_delta") or settings.get("input_type") == "delta"
                 if str(settings.get("type")).startswith(_STEP_CONTROLLERS) and is_delta:
                     return settings
     return {}
+
+
+def _json(value: Any) -> Any:
+    """The content of an attribute; None where it is no JSON."""
+    try:
+        return None if value is None else json.loads(_text(value))
+    except ValueError:
+        return None
 
 
 def _mappings(content: Any) -> Iterator[Mapping[str, Any]]:

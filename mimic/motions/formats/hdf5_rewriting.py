@@ -91,7 +91,7 @@ def _replace(episode: Any, label: str, replacement: Replacement) -> Iterator[str
 def _turn_steps(group: Any, controller: Mapping[str, Any], yaw: float) -> str:
     """Turns the commanded steps of the hand into the axes of the learner's base, where a controller has those."""
     if controller.get("input_ref_frame", "world") != "base" or not yaw:
-        return f"{ACTIONS}: steps of the hand, which the learner's has as well"
+        return f"{ACTIONS}: steps of the expert's hand, as in the source; with hand=exact the learner's are the same"
     steps, (cosine, sine) = np.array(group[ACTIONS]), (np.cos(yaw), np.sin(yaw))
     width = 6 if "POSE" in controller["type"] else 3
     for first in range(0, min(width, steps.shape[1]), 3):  # of the position, and of the rotation

@@ -24,12 +24,18 @@ class _Plan:
         self.replacement = replacement
         self.features: dict[str, Any] = dict(info["features"])
         self.columns: dict[str, list[Column]] = {}
+        self.whose = {entry: entry for entry in replacement.old_joints}  # entry of the motions that a feature has
         self.dropped: list[str] = []
         for entry, joints in replacement.old_joints.items():
             names = feature_names(self.features[entry])
             of_gripper, gripper = replacement.grippers.get(entry, ("", ()))
-            gripper = gripper if of_gripper == entry else ()
-            self.columns[entry], dropped = replaced_columns(names, joints, replacement.joints, gripper)
+            own = gripper if of_gripper == entry else ()
+            self.columns[entry], dropped = replaced_columns(names, joints, replacement.joints, own)
+            if gripper and not own and of_gripper not in self.whose:
+                self.whose[of_gripper] = entry
+                self.columns[of_gripper], _ = replaced_columns(
+                    feature_names(self.features[of_gripper]), (), (), gripper
+                )
             self.dropped += [f"{name} of {entry}" for name in dropped]
             self.features[entry] = _description(self.features[entry], self.columns[entry])
         kept = sorted(int(name.removeprefix(_EPISODE)) for name in replacement.kept)
@@ -41,7 +47,7 @@ class _Plan:
 
     def replaced(self, entry: str, old: int, values: np.ndarray) -> np.ndarray:
         """The new values of a feature in the frames of an episode."""
-        motion, count = self.replacement.motions[entry][f"{_EPISODE}{old}"], len(values)
+        motion, count = self.replacement.motions[self.whose[entry]][f"{_EPISODE}{old}"], len(values)
         rows = np.minimum(np.arange(len(motion.time)), count - 1)
         every = replaced_values(values[rows], self.columns[entry], motion)
         if len(motion.time) > count:

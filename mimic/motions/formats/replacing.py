@@ -64,7 +64,8 @@ def replaced_columns(
     replaced: set[Quantity] = set()
     for index, name in enumerate(names):
         parsed = parse_column(name)
-        joint = next((old for old in old_joints if parsed.joint.endswith(old)), "")  # after a prefix of the reader's
+        # After a prefix of the reader's; a number is not the end of another one.
+        joint = next((old for old in old_joints if re.search(rf"(?<!\d(?=\d)){re.escape(old)}$", parsed.joint)), "")
         if not joint and parsed.joint in gripper and parsed.quantity == ANGLE:
             columns.append(Column(name, index, GRIPPER, gripper.index(parsed.joint)))
         elif not joint:

@@ -80,6 +80,9 @@ def rewrite_archive(source: Path, out: Path, replacement: Replacement) -> list[s
     before, after = ([i for i in others if (i < place) == is_before] for is_before in (True, False))
     rows = _rows(motions, replacement.kept)
     kept = [motions[episode] for episode in replacement.kept]
+    for channel, name in enumerate(replacement.grippers.get(entry, ("", ()))[1]):
+        opening = np.concatenate([motion.gripper[:, channel] for motion in kept])  # type: ignore[index]
+        content["qpos"][rows, angle_at[names.index(name)]] = opening
     for key, at, of in (
         ("qpos", angle_at, lambda motion: motion.qpos),
         ("qvel", velocity_at, lambda motion: motion.qvel),

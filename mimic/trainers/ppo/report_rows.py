@@ -51,7 +51,8 @@ def rows(metrics: Metrics) -> list[Row]:
         rows = [(label, *_texts(form, metrics[key])) for label, key, form in _OF_MANY_ARMS]
         return [*rows[:3], *_worst_arms(metrics["arms"]), *rows[3:], *_counts(metrics["arms"])]
     rows: list[Row] = [(label, *_texts(form, metrics[key])) for label, key, form in _OF_ONE_ARM]
-    rows.insert(4, ("energy distance", *_texts("{:.4f}", metrics["energy_distance"])))
+    if metrics["energy_distance"]:
+        rows.insert(4, ("energy distance", *_texts("{:.4f}", metrics["energy_distance"])))
     rows[1:1] = _rows_of_kinds(metrics["by_kind"])
     rows += [
         (f"reward term {key.removeprefix('reward.')}", *_texts("{:.4f}", value))
