@@ -276,7 +276,7 @@ def test_motions_are_retargeted_to_any_learner(runs, tmp_path, own_registry):
         env = mimic.make(name, demonstrations={"count": 2, "held_out": 1})
         expert, out = tmp_path / f"{name}.npz", tmp_path / f"{name}-mapped.npz"
         env.demonstrations.save(expert)
-        config = RetargetConfig(str(expert), env_config(name), str(runs[run]), out=str(out))
+        config = RetargetConfig(demonstrations=str(expert), env=env_config(name), mapper=str(runs[run]), out=str(out))
         retarget.prepare_retargeting(config)()
         assert mimic.load_demonstrations(out).qpos.shape == (2, 51, joints)
     config = dataclasses.replace(config, mapper=str(runs["fixed"]), out=str(tmp_path / "new.npz"))

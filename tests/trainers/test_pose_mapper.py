@@ -119,7 +119,9 @@ def test_retargeted_motions_do_not_jump(learned, tmp_path):
     env = mimic.make("planar4dof", demonstrations={"count": 3, "held_out": 1})
     out = tmp_path / "learner.npz"
     env.demonstrations.save(tmp_path / "expert.npz")
-    config = RetargetConfig(str(tmp_path / "expert.npz"), env.config, str(learned[0]), out=str(out))
+    config = RetargetConfig(
+        demonstrations=str(tmp_path / "expert.npz"), env=env.config, mapper=str(learned[0]), out=str(out)
+    )
     retarget.prepare_retargeting(config)()
     motions = mimic.load_demonstrations(out)
     motions.check_fits(env.learner, 0.1, 50)
