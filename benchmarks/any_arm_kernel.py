@@ -25,7 +25,7 @@ from benchmarks.common.timing import time_program
 from mimic.arms.arm import build_arm
 from mimic.arms.arrays import MAX_JOINTS
 from mimic.arms.sampler import random_arm
-from mimic.control.joint_control import JointParameters, Reference, Target, action_target
+from mimic.control.joint_control import JointParameters, Reference, action_target
 from mimic.envs import env_config
 from mimic.envs.world_env import plant_of
 from mimic.physics import composite_kernel, inner_loop
@@ -91,7 +91,7 @@ def of_inner_loop(name: str, periods: int) -> Case:
     state = inner_loop.LoopState(reference.qpos, reference.qvel, reference, torque)
     parameters = JointParameters(*map(jnp.asarray, plant.constants.parameters))
 
-    def aim(action: jax.Array, reference: Reference) -> Target:
+    def aim(action: jax.Array, reference: Reference) -> jax.Array:
         return action_target(config.control, action, reference, parameters, jnp)
 
     state, target = jax.tree.map(jnp.asarray, (state, jax.vmap(aim)(action, reference)))

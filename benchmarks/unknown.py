@@ -30,7 +30,7 @@ from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect
 from benchmarks.motions import policies_of, test_motions
 from mimic.base.compilation import use_compilation_cache
-from mimic.control.joint_control import Reference, Target, friction_torque
+from mimic.control.joint_control import Reference, friction_torque
 from mimic.envs.imitation import arm_state
 from mimic.envs.world_env import HardwareEnv
 from mimic.envs.world_state import HardwareState
@@ -91,7 +91,7 @@ def predicted(env: HardwareEnv, draw: Draw, episode: HardwareState) -> tuple[Arr
     """Angles and velocities at which the next action will act, by a model from the last measurement."""
     qpos, qvel, *_ = jnp.split(episode.measured[0], 4)
     still = Reference(qpos, 0 * qvel, 0 * qvel)
-    before = Target(0 * qpos, jnp.ones_like(qpos))
+    before = 0 * qpos
     for age in reversed(range(max(env.world.action_delay))):  # the action that acts first is the oldest
         torque = episode.sent[jnp.minimum(age + 1, len(episode.sent) - 1)] * env.parameters.torque_scale
         after, _ = env.tick(draw, LoopState(qpos, qvel, still, torque), before, episode.sent[age])

@@ -10,8 +10,8 @@ from mimic.evaluation.labels import SPLITS
 from mimic.motions.demonstrations import Demonstrations
 from mimic.motions.formats.episodes import ANGLE, TORQUE, VELOCITY, ArmMotions, Episodes
 
-# What a policy commands, by `env.control`. The stiffness of joint_impedance is not written.
-_COMMANDS = {"torque": TORQUE, "joint_position": ANGLE, "joint_velocity": VELOCITY, "joint_impedance": ANGLE}
+# What a policy commands, by `env.control`.
+_COMMANDS = {"torque": TORQUE, "joint_position": ANGLE, "joint_velocity": VELOCITY}
 
 
 def rollout_episodes(

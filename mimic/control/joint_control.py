@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 Array = Any
 
-MODES = ("torque", "joint_position", "joint_velocity", "joint_impedance")
+MODES = ("torque", "joint_position", "joint_velocity")
 PERIOD = 0.001  # s, of the inner loop: that of the robots' interfaces, such as libfranka's
 # The working limits are these fractions of the manufacturer's: the arm itself exceeds its reference's speed and torque.
 VELOCITY_FRACTION, ACCELERATION_FRACTION, JERK_FRACTION, TORQUE_FRACTION = 0.95, 0.4, 0.9, 0.95
@@ -16,7 +16,6 @@ BRAKING_FRACTION = 0.7  # of the working acceleration and jerk, with which a ref
 APPROACH_RATE = 12.0  # 1/s: near its target angle a reference approaches it exponentially
 VELOCITY_RATE = 50.0  # 1/s: the same for velocities; above 4 APPROACH_RATE, so that nothing overshoots
 REACTION_FRACTION = 1.0  # of the time in which a reference reaches its full acceleration
-MIN_STIFFNESS = 0.5  # of joint_impedance, as a fraction of that of the other modes: softer arms leave their path
 
 
 class Reference(NamedTuple):
@@ -98,56 +97,32 @@ class ReferenceLimits(NamedTuple):
     speed: Approach
 
 
-class Target(NamedTuple):
-    """What a policy commands for one of its ticks.
+def action_target(mode: str, action: Array, reference: Reference, joints: JointParameters, xp: Any) -> Array:
+    """The target of an action in [-1, 1]: velocity [rad/s], angle [rad] or torque [N m], as the mode says.
 
-    Attributes:
-      value: angle [rad], velocity [rad/s] or torque [N m], as the mode says.
-      stiffness: factor on the joint's stiffness; 1 but for "joint_impedance".
-    """
-
-    value: Array
-    stiffness: Array
-
-
-def action_size(mode: str, joints: int) -> int:
-    """Length of an action: a number for each joint; for "joint_impedance" also the stiffness of each."""
-    return 2 * joints if mode == "joint_impedance" else joints
-
-
-def action_target(mode: str, action: Array, reference: Reference, joints: JointParameters, xp: Any) -> Target:
-    """The target of an action in [-1, 1].
-
-    "joint_velocity": velocity, as a fraction of the working limit. "joint_position": displacement of the target angle
-    from the reference, as a fraction of `reach`. "joint_impedance": the same, and then the logarithm of the stiffness,
-    from `MIN_STIFFNESS` for -1 to 1 for 1. "torque": as a fraction of `torque_scale`.
+    "joint_velocity": as a fraction of the working limit. "joint_position": displacement of the target angle from the
+    reference, as a fraction of `reach`. "torque": as a fraction of `torque_scale`.
 
     Args:
       mode: one of `MODES`.
-      action: [numbers] of `action_size`.
+      action: a number for each joint.
       reference: at the start of the tick.
       joints: parameters, [joints] each.
       xp: array library.
     """
     action = xp.maximum(xp.minimum(action, 1.0), -1.0)
-    size = joints.lower.shape[0]
-    value, full = action[:size], xp.ones_like(action[:size])
     if mode == "torque":
-        return Target(value * joints.torque_scale, full)
+        return action * joints.torque_scale
     if mode == "joint_velocity":
-        return Target(value * joints.velocity, full)
-    position = xp.maximum(xp.minimum(reference.qpos + value * joints.reach, joints.upper), joints.lower)
-    if mode == "joint_position":
-        return Target(position, full)
-    return Target(position, MIN_STIFFNESS ** (0.5 * (1.0 - action[size:])))
+        return action * joints.velocity
+    return xp.maximum(xp.minimum(reference.qpos + action * joints.reach, joints.upper), joints.lower)
 
 
 def action_towards(mode: str, displacement: Array, duration: Any, joints: JointParameters, xp: Any) -> Array:
-    """The action that moves a reference towards an angle, [..., numbers] in [-1, 1]: see `action_target`.
+    """The action that moves a reference towards an angle, [..., joints] in [-1, 1]: see `action_target`.
 
     Args:
-      mode: one of `MODES` but "torque". "joint_velocity" commands the velocity that is there after `duration`; the
-        others command the angle, "joint_impedance" at full stiffness.
+      mode: "joint_velocity", which commands the velocity that is there after `duration`, or "joint_position".
       displacement: from the reference to the angle, [..., joints] [rad].
       duration: [s].
       joints: parameters, [joints] each.
@@ -155,8 +130,7 @@ def action_towards(mode: str, displacement: Array, duration: Any, joints: JointP
     """
     assert mode in MODES and mode != "torque", mode
     reach = duration * joints.velocity if mode == "joint_velocity" else joints.reach
-    action = xp.clip(displacement / reach, -1.0, 1.0)
-    return xp.concatenate([action, xp.ones_like(action)], axis=-1) if mode == "joint_impedance" else action
+    return xp.clip(displacement / reach, -1.0, 1.0)
 
 
 def reference_limits(joints: JointParameters, period: float = PERIOD) -> ReferenceLimits:
@@ -244,7 +218,7 @@ def joint_torque(
     qpos: Array,
     qvel: Array,
     reference: Reference,
-    target: Target,
+    target: Array,
     previous: Array,
     joints: JointParameters,
     xp: Any,
@@ -257,18 +231,16 @@ def joint_torque(
       qpos: measured joint angles [rad].
       qvel: measured joint velocities [rad/s].
       reference: the motion to track.
-      target: of the policy.
+      target: of the policy; only that of the mode "torque" is used.
       previous: torque of the last period [N m].
       joints: parameters.
       xp: array library.
       period: [s].
     """
     if mode == "torque":
-        torque = target.value
+        torque = target
     else:
-        stiffness = target.stiffness * joints.stiffness
-        damping = xp.sqrt(target.stiffness) * joints.damping  # the damping ratio stays the same
-        torque = stiffness * (reference.qpos - qpos) + damping * (reference.qvel - qvel)
+        torque = joints.stiffness * (reference.qpos - qpos) + joints.damping * (reference.qvel - qvel)
         torque = torque + joints.inertia * reference.qacc + joints.friction * reference.qvel
     torque = _bounded(torque, joints.torque, xp)
     return previous + _bounded(torque - previous, joints.torque_rate * period, xp)

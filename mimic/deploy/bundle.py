@@ -12,7 +12,7 @@ import numpy as np
 from mimic.base.files import file_digest, read_json
 from mimic.base.npz import read_arrays
 from mimic.control.clearance import ClearanceConstants
-from mimic.control.joint_control import MODES, PERIOD, JointParameters, action_size
+from mimic.control.joint_control import MODES, PERIOD, JointParameters
 from mimic.control.limits import JointLimits
 
 FORMAT = 4
@@ -67,11 +67,6 @@ class Bundle:
     def num_joints(self) -> int:
         """Number of joints."""
         return len(self.joint_names)
-
-    @property
-    def action_size(self) -> int:
-        """Length of an action."""
-        return action_size(self.mode, self.num_joints)
 
     @property
     def ticks(self) -> int:

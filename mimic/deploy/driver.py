@@ -28,12 +28,10 @@ class Command(NamedTuple):
       path: the reference after each `STEP` periods of 1 ms, [steps, joints] each [rad, rad/s, rad/s^2]; a robot without
         a loop for paths takes its end alone, `qpos` and `qvel`.
       stop: [joints] pose in which the arm comes to rest where it brakes at the end of the path [rad].
-      stiffness: [joints] factor on the stiffness of the joints; 1 but for "joint_impedance".
     """
 
     path: Reference
     stop: np.ndarray
-    stiffness: np.ndarray
 
     @property
     def qpos(self) -> np.ndarray:

@@ -38,7 +38,7 @@ class FrankyDriver:
       library: the module; default: franky.
 
     Raises:
-      ValueError: franky is not installed, or the bundle has another arm or a stiffness of its own.
+      ValueError: franky is not installed, or the bundle has another arm.
       RobotAbort: the robot cannot be reached, or rejects its settings.
     """
 
@@ -51,11 +51,8 @@ class FrankyDriver:
         collision_force: Sequence[float] = COLLISION_FORCE,
         library: Any = None,
     ):
-        if bundle.num_joints != JOINTS or bundle.mode == "joint_impedance":
-            raise ValueError(
-                f"franky: expected a bundle with {JOINTS} joints and the mode joint_velocity or joint_position, got "
-                f"{bundle.num_joints} and {bundle.mode}"
-            )
+        if bundle.num_joints != JOINTS:
+            raise ValueError(f"franky: expected a bundle with {JOINTS} joints, got {bundle.num_joints}")
         self._library = _import() if library is None else library
         self._errors = (*(getattr(self._library, name) for name in _ERRORS), RuntimeError)
         self._robot = self._call(self._library.Robot, address)

@@ -60,12 +60,12 @@ class Policy:
     """
 
     def __init__(self, bundle: Bundle, motions: Sequence[int]):
-        joints, size = bundle.num_joints, bundle.action_size
+        joints = bundle.num_joints
         self._expert, self._preview = bundle.expert[np.asarray(motions)], np.arange(bundle.preview + 1)
-        self._past = np.zeros((len(motions), bundle.past_actions * size), np.float32)
+        self._past = np.zeros((len(motions), bundle.past_actions * joints), np.float32)
         sizes = dict.fromkeys(OBSERVED, joints) | {"past_actions": self._past.shape[1]}
         sizes["expert"] = len(self._preview) * bundle.expert_numbers
-        self._session = open_session(bundle.folder / POLICY, sizes, {"action": size})
+        self._session = open_session(bundle.folder / POLICY, sizes, {"action": joints})
 
     def act(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> np.ndarray:
         """The actions [robots, numbers] at a tick, of measured and reference motions [robots, joints]."""

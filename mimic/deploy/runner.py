@@ -163,7 +163,7 @@ class _Run:
             self._ticks += 1
         command = layer.tick(state.qpos[:, None], state.qvel[:, None], action)
         path = Reference(*(x[..., 0] for x in command.path))
-        return Command(path, command.stop[:, 0], command.stiffness[:, 0])
+        return Command(path, command.stop[:, 0])
 
     def report(self, cause: str, *, aborted: bool) -> Report:
         """The report of the run."""

@@ -38,8 +38,7 @@ def check_supported(control: str, control_dt: float, config: SafetyConfig | None
     config = config or SafetyConfig()
     if control == "torque":
         raise ValueError(
-            "mode: expected joint_position, joint_velocity or joint_impedance, whose targets have a braking path, "
-            "got torque"
+            "mode: expected joint_position or joint_velocity, whose targets have a braking path, got torque"
         )
     step = STEP * PERIOD
     are_whole = all(abs(time / step - round(time / step)) < 1e-6 for time in (control_dt, config.latency))
@@ -88,8 +87,8 @@ class SafetyLayer:
         self._range = bundle.limits.position[:, 0, None], bundle.limits.position[:, 1, None]
         self._size = bundle.num_joints, robots
         self._path = np.zeros((3, self._hold + self._paths.brake_steps, *self._size))  # since the last command
-        self._action, self._repeats = np.zeros((bundle.action_size, robots)), np.zeros(robots, int)
-        self._stiffness, self._has_action = np.ones(self._size), np.zeros(robots, bool)
+        self._action, self._repeats = np.zeros(self._size), np.zeros(robots, int)
+        self._has_action = np.zeros(robots, bool)
         self.cause = np.full(robots, "", object)
         self.counts = {name: np.zeros(robots, int) for name in INTERVENTIONS}
         self.tracking_error, self.clearance = np.zeros(robots), np.full(robots, np.inf)
@@ -124,21 +123,20 @@ class SafetyLayer:
 
         Args:
           qpos, qvel: measured [rad, rad/s].
-          action: [numbers, robots] in [-1, 1]; None makes all arms brake.
+          action: [joints, robots] in [-1, 1]; None makes all arms brake.
           is_present: [robots] whether a new action has arrived; otherwise the last one is used again. Default: all.
         """
         self._check_measured(qpos, qvel)
         begin, rest = Reference(*self._path[:, self._hold - 1]), self._rest()
-        self._path, self._stiffness = rest, self._stiffness.copy()
+        self._path = rest
         is_candidate = np.zeros(self._size[1], bool) if action is None else self._candidates(action, is_present)
         if np.any(is_candidate):
             target = action_target(self._mode, self._action, begin, self._joints, np)
-            path = self._paths.target_path(begin, target.value)
+            path = self._paths.target_path(begin, target)
             is_safe = self._is_safe(np.concatenate([begin.qpos[None], path[0]]))
             self.counts[COLLISION] += is_candidate & ~is_safe
             self._path = np.where(is_candidate & is_safe, extended(path, rest.shape[1]), rest)
-            self._stiffness = np.where(is_candidate & is_safe, target.stiffness, self._stiffness)
-        return Command(Reference(*self._path[:, : self._hold]), self._path[0, -1], self._stiffness)
+        return Command(Reference(*self._path[:, : self._hold]), self._path[0, -1])
 
     def skip(self) -> None:
         """Counts a tick that has passed without a command: the arms have begun to brake by themselves."""

@@ -155,7 +155,7 @@ class EnvConfig:
       physics: "mjx"; "fused": the same equations in one fused kernel, many times faster; or "auto": "fused" where it
         covers the learner exactly, otherwise "mjx", see `choose_physics` in mimic/physics/step.py.
       control: what an action is: "torque", which is constant in a control step (paper); or the target of an inner loop
-        at 1 kHz: "joint_position", "joint_velocity" or "joint_impedance", see `mimic.control`; only in a `world`.
+        at 1 kHz: "joint_position" or "joint_velocity", see `mimic.control`; only in a `world`.
       world: gravity, friction, load, sensors and delays, and an inner loop at 1 kHz; null in the paper's world.
       randomization: how the learner's dynamics differ from its model.
       preview: how many control steps ahead the learner also observes the expert; 0 is the paper.

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from mimic.arms.arm import Arm
 from mimic.control import joint_control
-from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target
+from mimic.control.joint_control import PERIOD, JointParameters, Reference
 from mimic.envs.arm_state import ArmState
 from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import ImitationEnv, observed_parts
@@ -45,7 +45,6 @@ class HardwareEnv(ImitationEnv):
       plant: the learner, as the inner loop simulates it.
       torque_scale: [joints] maximum torque [N m].
       parameters: of the inner loop, [joints] each.
-      action_size: length of an action.
 
     Raises:
       ValueError: arms, demonstrations or settings that do not fit.
@@ -88,7 +87,7 @@ class HardwareEnv(ImitationEnv):
     def _make_fused_loop(self, periods: int) -> MjxLoop:
         loop = make_inner_loop(self.config.control, self.plant.constants, periods)
 
-        def run(draw: Draw, state: LoopState, target: Target) -> LoopState:
+        def run(draw: Draw, state: LoopState, target: Float[Array, " joints"]) -> LoopState:
             return loop(self.plant.episode(draw), state, target)
 
         return run
@@ -98,11 +97,6 @@ class HardwareEnv(ImitationEnv):
         env = copy.copy(self)
         env.config = dataclasses.replace(self.config, world=dataclasses.replace(self.world, contacts=False))
         return cast(HardwareEnv, env.with_physics("mjx"))
-
-    @property
-    def action_size(self) -> int:
-        """Length of an action, see `joint_control.action_target`."""
-        return joint_control.action_size(self.config.control, self.learner.num_joints)
 
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> HardwareState:
         """The first state of an episode: at rest near the start pose, which is also the reference."""
@@ -119,8 +113,7 @@ class HardwareEnv(ImitationEnv):
         fields |= {"qpos": qpos, "load": None, "reference": reference, "torque": zero, "draw": draw}
         measured = self._measure(LoopState(qpos, zero, reference, zero), draw, state.key, state.step)
         history = jnp.tile(measured, (MAX_DELAY + 1 + self.world.history, 1))
-        is_angle = self.config.control in ("joint_position", "joint_impedance")
-        target = Target(reference.qpos if is_angle else zero, jnp.ones_like(qpos))  # the arm stays where it is
+        target = reference.qpos if self.config.control == "joint_position" else zero  # the arm stays where it is
         return HardwareState(**fields, sent=sent, arrived=actions, target=target, measured=history)
 
     def _simulate(
@@ -153,8 +146,8 @@ class HardwareEnv(ImitationEnv):
         return after, loop.torque
 
     def tick(
-        self, draw: Draw, loop: LoopState, before: Target, acting: Float[Array, " numbers"]
-    ) -> tuple[LoopState, Target]:
+        self, draw: Draw, loop: LoopState, before: Float[Array, " joints"], acting: Float[Array, " numbers"]
+    ) -> tuple[LoopState, Float[Array, " joints"]]:
         """Arm and inner loop after a tick, and the target at its end.
 
         Args:
@@ -198,7 +191,7 @@ class HardwareEnv(ImitationEnv):
     def command(self, before: ArmState, action: Float[Array, " numbers"]) -> Float[Array, " joints"]:
         """The target angles [rad], velocities [rad/s] or torques [N m] of an action that arrives at once."""
         reference = cast(HardwareState, before).reference
-        return joint_control.action_target(self.config.control, action, reference, self.parameters, jnp).value
+        return joint_control.action_target(self.config.control, action, reference, self.parameters, jnp)
 
     def observe(self, state: ArmState) -> Float[Array, " observation"]:
         """See the class, and `control_observation`."""

@@ -3,7 +3,7 @@
 from flax import struct
 from jaxtyping import Array, Float
 
-from mimic.control.joint_control import Reference, Target
+from mimic.control.joint_control import Reference
 from mimic.envs.arm_state import ArmState
 from mimic.physics.plant import Draw
 
@@ -26,6 +26,6 @@ class HardwareState(ArmState):
     torque: Float[Array, " joints"]
     sent: Float[Array, "ticks numbers"]
     arrived: Float[Array, "ticks numbers"]
-    target: Target
+    target: Float[Array, " joints"]
     measured: Float[Array, "ticks numbers"]
     draw: Draw

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from mimic.base import fused_kernel
 from mimic.control import joint_control
-from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target
+from mimic.control.joint_control import PERIOD, JointParameters, Reference
 from mimic.physics import composite_kernel, looped_dynamics
 from mimic.physics.composite_kernel import read_joints, read_rows, write_rows
 from mimic.physics.dynamics import acceleration, loaded
@@ -73,11 +73,11 @@ class LoopState(NamedTuple):
     torque: Any
 
 
-InnerLoop = Callable[[Episode, LoopState, Target], LoopState]
+InnerLoop = Callable[[Episode, LoopState, Array], LoopState]
 
 
 def make_inner_loop(mode: str, constants: JointConstants, periods: int) -> InnerLoop:
-    """Makes a function (episode, state, target) -> state after `periods` ms.
+    """Makes a function (episode, state, [joints] target) -> state after `periods` ms.
 
     It takes one sample, and is a single kernel on NVIDIA GPUs if it is batched by `jax.vmap`.
 
@@ -90,19 +90,19 @@ def make_inner_loop(mode: str, constants: JointConstants, periods: int) -> Inner
     kernel = gpu_kernel(mode, constants, periods)
     function = fused_kernel.batched_by(kernel, plain, fused_kernel.with_batch_last(plain))
 
-    def inner_loop(episode: Episode, state: LoopState, target: Target) -> LoopState:
+    def inner_loop(episode: Episode, state: LoopState, target: Array) -> LoopState:
         (after,) = function(*flattened(episode, state, target))
         return _state_of(after.reshape(-1, _ROWS).T)
 
     return inner_loop
 
 
-def flattened(episode: Episode, state: LoopState, target: Target) -> tuple[Array, ...]:
+def flattened(episode: Episode, state: LoopState, target: Array) -> tuple[Array, ...]:
     """The arguments of a sample as vectors, with the numbers of each joint together, as `gpu_kernel` takes them."""
     drive = episode.gain, episode.friction, episode.bias
     motion = state.qpos, state.qvel, *state.reference, state.torque
-    by_joint = (jnp.stack(arrays, axis=1).ravel() for arrays in (drive, motion, target))
-    return episode.numbers, episode.base, *by_joint
+    by_joint = (jnp.stack(arrays, axis=1).ravel() for arrays in (drive, motion))
+    return episode.numbers, episode.base, *by_joint, target
 
 
 def _state_of(rows: Any) -> LoopState:
@@ -117,7 +117,7 @@ def control(
     mode: str,
     constants: JointConstants,
     state: LoopState,
-    target: Target,
+    target: Any,
     drive: Sequence[Any],
 ) -> tuple[Reference, Any, Any]:
     """One period of the controller: the reference, the commanded torque and the torque that acts on the arm [N m].
@@ -132,9 +132,7 @@ def control(
     gain, friction, bias = drive
     reference, joints = state.reference, constants.parameters
     if mode != "torque":
-        reference = joint_control.next_reference(
-            mode, reference, target.value, joint_control.reference_limits(joints), jnp
-        )
+        reference = joint_control.next_reference(mode, reference, target, joint_control.reference_limits(joints), jnp)
     torque = joint_control.joint_torque(
         mode, state.qpos + bias, state.qvel, reference, target, state.torque, joints, jnp
     )
@@ -156,13 +154,13 @@ def array_loop(mode: str, constants: JointConstants, periods: int) -> Callable[.
     def loop(numbers: Array, base: Array, drive: Array, motion: Array, target: Array) -> tuple[Array]:
         batch = numbers.shape[1:]
         by_joint = numbers.reshape(-1, NUMBERS, *batch)
-        by_row = (jnp.moveaxis(x.reshape(joints, -1, *batch), 1, 0) for x in (drive, motion, target))
-        drives, motions, targets = map(list, by_row)
+        by_row = (jnp.moveaxis(x.reshape(joints, -1, *batch), 1, 0) for x in (drive, motion))
+        drives, motions = map(list, by_row)
         parameters = jax.tree.map(lambda x: jnp.asarray(x, motion.dtype).reshape(joints, *[1] * len(batch)), constants)
         one = jnp.ones((), motion.dtype)
 
         def period(_: Any, state: LoopState) -> LoopState:
-            reference, torque, acting = control(mode, parameters, state, Target(*targets), drives)
+            reference, torque, acting = control(mode, parameters, state, target, drives)
             qacc = looped_dynamics.acceleration(by_joint, state.qpos, state.qvel, acting, one, one, tuple(base))
             qvel = state.qvel + PERIOD * qacc
             return LoopState(state.qpos + PERIOD * qvel, qvel, reference, torque)
@@ -196,8 +194,8 @@ def gpu_kernel(
 
         def period(_: Any, states: tuple[LoopState, ...]) -> tuple[LoopState, ...]:
             controlled = []
-            for joint, state, target, drive in zip(by_joint, states, targets, drives, strict=True):
-                controlled.append(control(mode, joint, state, Target(*target), drive))
+            for joint, state, (target,), drive in zip(by_joint, states, targets, drives, strict=True):
+                controlled.append(control(mode, joint, state, target, drive))
             qpos, qvel, *_ = zip(*states, strict=True)
             acting = [torque for _, _, torque in controlled]
             qacc = acceleration(joints, qpos, qvel, acting, base_acceleration, cosine_and_sine)

@@ -5,16 +5,16 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from mujoco import mjx
 
 from mimic.control import joint_control
-from mimic.control.joint_control import Target
 from mimic.physics.inner_loop import LoopState, control
 from mimic.physics.mujoco_world import MujocoWorld, loaded_fields
 from mimic.physics.plant import Draw, Plant
 from mimic.physics.step import constant
 
-MjxLoop = Callable[[Draw, LoopState, Target], LoopState]
+MjxLoop = Callable[[Draw, LoopState, Array], LoopState]
 
 
 def make_mjx_loop(mode: str, plant: Plant, world: MujocoWorld, periods: int) -> MjxLoop:
@@ -33,7 +33,7 @@ def make_mjx_loop(mode: str, plant: Plant, world: MujocoWorld, periods: int) -> 
     device = jax.local_devices()[0]
     parts = jax.device_get((mjx.put_model(world.model, device=device), mjx.make_data(world.model, device=device)))
 
-    def loop(draw: Draw, state: LoopState, target: Target) -> LoopState:
+    def loop(draw: Draw, state: LoopState, target: Array) -> LoopState:
         model, data = jax.tree.map(constant, parts)
         model = _with_draw(model, world, draw)
         by_row = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), constants)

@@ -41,8 +41,8 @@ def test_reference_stays_within_the_manufacturers_limits(mode: str, hold: int) -
     rng, rows = np.random.default_rng(hold), []
     for step in range(max(2000, 10 * hold)):
         if step % hold == 0:
-            action = rng.choice([-1.0, 1.0, 0.3, 0.0], joint_control.action_size(mode, JOINTS))
-            target = joint_control.action_target(mode, action, reference, joints, np).value
+            action = rng.choice([-1.0, 1.0, 0.3, 0.0], JOINTS)
+            target = joint_control.action_target(mode, action, reference, joints, np)
         reference = joint_control.next_reference(mode, reference, target, working, np)
         rows.append(reference)
     qpos, qvel, qacc = (np.stack(x) for x in zip(*rows, strict=True))
@@ -84,7 +84,7 @@ def test_torque_changes_at_most_at_its_rate() -> None:
     limits, joints, reference = panda_limits(), parameters(), start()
     rng, torque = np.random.default_rng(0), np.zeros(JOINTS)
     for _ in range(500):
-        target = joint_control.Target(rng.uniform(-500, 500, JOINTS), np.ones(JOINTS))
+        target = rng.uniform(-500, 500, JOINTS)
         qpos = reference.qpos + rng.normal(size=JOINTS)
         for mode in ("torque", "joint_position"):
             after = joint_control.joint_torque(mode, qpos, np.zeros(JOINTS), reference, target, torque, joints, np)
@@ -98,31 +98,20 @@ def test_the_torque_is_critically_damped_control_of_the_reference() -> None:
     joints = parameters()._replace(torque=unlimited, torque_rate=unlimited)
     np.testing.assert_allclose(joints.damping**2, 4 * joints.stiffness * joints.inertia)
     reference = Reference(*(np.full(JOINTS, value) for value in (0.01, 0.2, 3.0)))
-    target, rest = joint_control.Target(np.zeros(JOINTS), np.full(JOINTS, 0.25)), np.zeros(JOINTS)
-    torque = joint_control.joint_torque("joint_impedance", rest, rest, reference, target, rest, joints, np)
-    expected = (
-        0.25 * joints.stiffness * 0.01 + 0.5 * joints.damping * 0.2 + joints.inertia * 3.0 + joints.friction * 0.2
-    )
+    rest = np.zeros(JOINTS)
+    torque = joint_control.joint_torque("joint_position", rest, rest, reference, rest, rest, joints, np)
+    expected = joints.stiffness * 0.01 + joints.damping * 0.2 + joints.inertia * 3.0 + joints.friction * 0.2
     np.testing.assert_allclose(torque, expected)
 
 
-def test_impedance_action_sets_the_stiffness() -> None:
-    joints = parameters()
-    action = np.concatenate([np.zeros(JOINTS), np.linspace(-1, 1, JOINTS)])
-    target = joint_control.action_target("joint_impedance", action, start(), joints, np)
-    np.testing.assert_allclose(target.stiffness[[0, -1]], [joint_control.MIN_STIFFNESS, 1.0])
-    np.testing.assert_allclose(target.value, start().qpos)
-
-
-@pytest.mark.parametrize("mode", ["joint_velocity", "joint_position", "joint_impedance"])
+@pytest.mark.parametrize("mode", ["joint_velocity", "joint_position"])
 def test_an_action_towards_an_angle_has_the_target_that_leads_there(mode: str) -> None:
     joints, reference, duration = parameters(), start(), 0.2
     displacement = 0.05 * np.random.default_rng(0).uniform(-1, 1, len(reference.qpos))
     action = joint_control.action_towards(mode, displacement, duration, joints, np)
     target = joint_control.action_target(mode, action, reference, joints, np)
-    moved = target.value * duration if mode == "joint_velocity" else target.value - reference.qpos
+    moved = target * duration if mode == "joint_velocity" else target - reference.qpos
     np.testing.assert_allclose(moved, displacement, atol=1e-12)
-    np.testing.assert_array_equal(target.stiffness, 1.0)
     many = np.stack([displacement, 100 * displacement])
     actions = joint_control.action_towards(mode, many, duration, joints, np)
     np.testing.assert_array_equal(actions[0], action)
@@ -140,12 +129,12 @@ def test_jax_and_numpy_agree(mode: str) -> None:
         reference = Reference(*(xp.asarray(x, dtype) for x in start()))
         torque = xp.zeros(JOINTS, dtype)
         for _ in range(5):
-            action = xp.asarray(rng.uniform(-1, 1, joint_control.action_size(mode, JOINTS)), dtype)
+            action = xp.asarray(rng.uniform(-1, 1, JOINTS), dtype)
             target = joint_control.action_target(mode, action, reference, values, xp)
             for _ in range(10):
                 if mode != "torque":
                     reference = joint_control.next_reference(
-                        mode, reference, target.value, joint_control.reference_limits(values), xp
+                        mode, reference, target, joint_control.reference_limits(values), xp
                     )
                 torque = joint_control.joint_torque(
                     mode, reference.qpos, reference.qvel * 0, reference, target, torque, values, xp

@@ -20,7 +20,7 @@ def bundle(tmp_path):
 
 
 def test_a_bundle_is_read(bundle):
-    assert (bundle.mode, bundle.ticks, bundle.periods, bundle.action_size) == ("joint_velocity", bundles.TICKS, 50, 7)
+    assert (bundle.mode, bundle.ticks, bundle.periods) == ("joint_velocity", bundles.TICKS, 50)
     np.testing.assert_allclose(bundle.parameters.stiffness, bundles.parameters().stiffness)
     assert bundle.limits.velocity[0] == 2.175 and bundle.joint_names[0] == "joint1"
     assert bundle.motion_index("motion 1") == bundle.motion_index(1) == 1

@@ -195,9 +195,7 @@ def test_a_robot_that_cannot_be_reached_is_an_abort(bundle):
 
 def test_a_bundle_that_does_not_fit_is_rejected(bundle):
     module = library(bundle.start_pose)
-    with pytest.raises(ValueError, match="expected a bundle with 7 joints and the mode .* got 7 and joint_impedance"):
-        FrankyDriver("192.0.2.1", dataclasses.replace(bundle, mode="joint_impedance"), library=module)
-    with pytest.raises(ValueError, match="got 6 and joint_velocity"):
+    with pytest.raises(ValueError, match="expected a bundle with 7 joints, got 6"):
         FrankyDriver("192.0.2.1", dataclasses.replace(bundle, joint_names=("a",) * 6), library=module)
 
 

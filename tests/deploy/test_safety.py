@@ -303,26 +303,13 @@ def test_scales_slow_the_reference_down(bundle):
     assert path[:, 2].max() == pytest.approx(0.2 * limits.acceleration[0], rel=1e-3)
 
 
-def test_the_stiffness_is_that_of_the_accepted_target(tmp_path):
-    bundle = bundles.make_bundle(tmp_path / "soft", mode="joint_impedance")
-    layer, soft = started(bundle), [0.0] * 7 + [-1.0] * 7
-    zero = np.zeros((7, 1))
-    command = layer.tick(layer.reference.qpos, zero, np.array(soft)[:, None])
-    np.testing.assert_allclose(command.stiffness, 0.5)
-    down = np.array([0.0, 1, 0, 0, 0, 0, 0] + [1.0] * 7)[:, None]
-    layer._clearance = lambda rows: np.where(np.arange(len(rows)) == len(rows) - 1, 0.006, 1.0)
-    rejected = layer.tick(layer.reference.qpos, zero, down)
-    assert layer.counts[COLLISION][0] == 1
-    np.testing.assert_allclose(rejected.stiffness, 0.5)
-
-
 def test_torque_policies_and_other_ticks_are_rejected(bundle):
     with pytest.raises(ValueError, match="got torque"):
         SafetyLayer(dataclasses.replace(bundle, mode="torque"), Clearance(bundle))
     for control_dt, latency in ((0.02, 0.02), (0.055, 0.02), (0.05, 0.025)):
         with pytest.raises(ValueError, match=f"got {control_dt} s and {latency} s"):
             check_supported("joint_velocity", control_dt, SafetyConfig(latency=latency))
-    check_supported("joint_impedance", 0.03)
+    check_supported("joint_position", 0.03)
 
 
 @pytest.mark.parametrize(

@@ -162,8 +162,8 @@ def test_what_is_drawn_lies_in_its_ranges_and_changes_the_motion(nominal, action
     assert 1e-4 < difference < 0.1  # the inner loop holds the arm near its reference
 
 
-@pytest.mark.slow_for("joint_impedance", "joint_position", "torque")
-@pytest.mark.parametrize("control", ["torque", "joint_position", "joint_velocity", "joint_impedance"])
+@pytest.mark.slow_for("joint_position", "torque")
+@pytest.mark.parametrize("control", ["torque", "joint_position", "joint_velocity"])
 def test_each_mode_moves_the_arm_within_its_limits(control):
     env = make(control=control)
     actions = (0.02 if control == "torque" else 0.3) * jnp.ones((TICKS, env.action_size))

@@ -20,11 +20,7 @@ def make_evaluator(**fields) -> Evaluator:
 @pytest.mark.slow_for("joint_velocity")
 @pytest.mark.parametrize(
     "control",
-    [
-        "joint_velocity",
-        pytest.param("joint_position", marks=pytest.mark.slow),
-        pytest.param("joint_impedance", marks=pytest.mark.slow),
-    ],
+    ["joint_velocity", pytest.param("joint_position", marks=pytest.mark.slow)],
 )
 def test_it_is_much_nearer_than_the_start_pose(control):
     """A gap of 1 is that of holding; 0.1 % with velocities, 0.8 % with angles by measurement, without delays."""

@@ -12,7 +12,7 @@ from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.arms.drives import drives_of
 from mimic.control.clearance import ClearanceConstants
-from mimic.control.joint_control import JointParameters, action_size
+from mimic.control.joint_control import JointParameters
 from mimic.deploy.bundle import load_bundle, write_bundle
 from mimic.envs import env_config
 from mimic.metric.capsule_distances import clearance_constants
@@ -92,7 +92,7 @@ def make_bundle(
     expert[:, :, 0] = 2 * np.pi * CONTROL_DT * np.arange(ticks + 1)  # one cycle a second
     write_bundle(
         folder,
-        policy=network or policy(joints, action_size(mode, joints), action),
+        policy=network or policy(joints, joints, action),
         clearance=clearance or panda_clearance(locked),
         controller={
             "mimic_version": "test",

@@ -57,7 +57,7 @@ class VirtualRobot:
 
     def write(self, command):
         path = Reference(*(x[..., None] for x in command.path))
-        self._loop.command(Command(path, command.stop[:, None], command.stiffness[:, None]))
+        self._loop.command(Command(path, command.stop[:, None]))
 
     def stop(self):
         pass

@@ -12,7 +12,7 @@ import pytest
 from mimic.arms.arm import build_arm
 from mimic.base.fused_kernel import LaunchConfig
 from mimic.control import joint_control
-from mimic.control.joint_control import MODES, PERIOD, JointParameters, Reference, Target
+from mimic.control.joint_control import MODES, PERIOD, JointParameters, Reference
 from mimic.envs import env_config
 from mimic.envs.world_env import plant_of
 from mimic.physics.inner_loop import LoopState, flattened, gpu_kernel, make_inner_loop
@@ -99,7 +99,7 @@ def simulate_in_mujoco(arm, plant, draw: Draw, mode: str, targets) -> np.ndarray
     for target in targets:
         for _ in range(PERIODS):
             if mode != "torque":
-                reference = joint_control.next_reference(mode, reference, target.value, limits, np)
+                reference = joint_control.next_reference(mode, reference, target, limits, np)
             qpos = data.qpos + np.asarray(draw.bias)
             torque = joint_control.joint_torque(
                 mode, qpos, data.qvel, reference, target, torque, constants.parameters, np
@@ -125,12 +125,8 @@ def targets_for(arm, plant, mode: str, ticks: int):
     home = np.asarray(arm.embodiment.home)
     reference = Reference(home, np.zeros(joints), np.zeros(joints))
     scale = 0.1 if mode == "torque" else 0.4
-    actions = scale * rng.uniform(-1, 1, (ticks, joint_control.action_size(mode, joints)))
+    actions = scale * rng.uniform(-1, 1, (ticks, joints))
     return [joint_control.action_target(mode, action, reference, parameters, np) for action in actions]
-
-
-def as_arrays(target: Target, dtype) -> Target:
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype), target)
 
 
 @pytest.mark.slow_for(*(f"panda7dof-{mode}" for mode in MODES if mode != "joint_position"))
@@ -146,7 +142,7 @@ def test_a_second_is_that_of_c_mujoco(arm_and_plant, mode):
     loop, state, rows = jax.jit(make_inner_loop(mode, plant.constants, PERIODS)), start_of(arm, np.float32), []
     episode = jax.jit(plant.episode)(draw)
     for target in targets:
-        state = loop(episode, state, as_arrays(target, jnp.float32))
+        state = loop(episode, state, jnp.asarray(target, jnp.float32))
         rows.append(state.qpos)
     lower, upper = np.asarray(arm.embodiment.joint_range).T
     assert np.all((expected > lower) & (expected < upper))
@@ -163,7 +159,7 @@ def test_in_double_precision_only_rounding_is_left(name, x64):
     loop, state = jax.jit(make_inner_loop("joint_position", plant.constants, PERIODS)), start_of(arm, np.float64)
     episode = plant.episode(jax.tree.map(jnp.asarray, draw))
     for target in targets:
-        state = loop(episode, state, as_arrays(target, jnp.float64))
+        state = loop(episode, state, jnp.asarray(target, jnp.float64))
     np.testing.assert_allclose(state.qpos, expected[-1], rtol=0, atol=1e-12)
 
 
@@ -178,7 +174,7 @@ def test_the_kernel_equals_the_arrays(arm_and_plant, mode, interpreted):
     home = np.asarray(arm.embodiment.home)
     qpos, qvel, *reference, torque = (0.1 * rng.normal(size=(6, count, joints))).astype(np.float32)
     state = LoopState(home + qpos, qvel, Reference(home + reference[0], *reference[1:]), torque)
-    target = Target(*0.1 * rng.normal(size=(2, count, joints)) + np.array([0.0, 1.0])[:, None, None])
+    target = 0.1 * rng.normal(size=(count, joints))
     arguments = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (jax.vmap(plant.episode)(batch), state, target))
     kernel = gpu_kernel(mode, plant.constants, periods, LaunchConfig(block=32, warps=1))
     (actual,) = jax.jit(kernel)(*jax.vmap(flattened)(*arguments))
@@ -192,8 +188,7 @@ def test_the_kernel_equals_the_arrays(arm_and_plant, mode, interpreted):
 def test_the_kernel_lowers_without_a_gpu(arm_and_plant):
     arm, plant = arm_and_plant
     home, episode = start_of(arm, np.float32), plant.episode(draw_for(arm.embodiment.num_joints))
-    target = Target(home.qvel, 1 + home.qvel)
-    batch = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x, jnp.float32)] * 2), (episode, home, target))
+    batch = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x, jnp.float32)] * 2), (episode, home, home.qvel))
     assert "triton" in gpu_program(jax.jit(jax.vmap(make_inner_loop("joint_velocity", plant.constants, 2))), *batch)
 
 
@@ -205,7 +200,7 @@ def test_stops_hold_an_arm_that_is_driven_into_them(arm_and_plant):
     draw = dataclasses.replace(draw_for(joints), gravity_error=jnp.asarray(0.0))
     torque = np.asarray(plant.constants.parameters.torque) * 0.3
     loop, state = jax.jit(make_inner_loop("torque", plant.constants, PERIODS)), start_of(arm, np.float32)
-    target, episode = as_arrays(Target(torque, np.ones(joints)), jnp.float32), plant.episode(draw)
+    target, episode = jnp.asarray(torque, jnp.float32), plant.episode(draw)
     for _ in range(60):
         state = loop(episode, state, target)
     beyond = np.asarray(state.qpos) - np.asarray(arm.embodiment.joint_range)[:, 1]

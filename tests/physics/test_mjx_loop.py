@@ -11,7 +11,7 @@ import pytest
 from mimic.arms.arm import build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.control import joint_control
-from mimic.control.joint_control import Reference, Target
+from mimic.control.joint_control import Reference
 from mimic.envs import env_config
 from mimic.envs.world_env import plant_of
 from mimic.metric.capsule_distances import colliding_pairs
@@ -21,11 +21,6 @@ from mimic.physics.mujoco_world import mujoco_world
 from tests.physics.test_inner_loop import draw_for
 
 PERIODS, TICKS = 50, 12
-
-
-def push(joints: int, torque: np.ndarray) -> Target:
-    assert len(torque) == joints
-    return Target(torque, np.ones(joints))
 
 
 def in_mujoco(model, plant, draw, home, target):
@@ -84,7 +79,7 @@ def test_stops_and_contacts_are_those_of_c_mujoco(case, torque, touches):
     """Up to what two solvers differ: MJX iterates in single precision and finds the points of a contact on its own."""
     arm, plant, world, draw, loop = case
     joints, home = arm.embodiment.num_joints, np.asarray(arm.embodiment.home)
-    target = push(joints, np.array(torque))
+    target = np.array(torque)
     model = world.model
     model.opt.gravity[:] = 0.0  # the draw has no error of the compensation
     expected, contacts = in_mujoco(model, plant, draw, home, target)

@@ -154,7 +154,7 @@ class SafeController:
         config = config or SafetyConfig()
         self._policy = policy or Policy(bundle, motion.tolist())
         self._layer = SafetyLayer(bundle, Clearance(bundle), len(motion), config)
-        self._channel = Channel(world, bundle.action_size, seed)
+        self._channel = Channel(world, bundle.num_joints, seed)
         self.ticks, self.periods = bundle.ticks, bundle.periods
         self._latency, self._left, self._command = round(config.latency / PERIOD), -1, None
         qpos, qvel = robots.measure()

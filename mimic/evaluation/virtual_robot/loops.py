@@ -12,7 +12,6 @@ from mimic.control.joint_control import (
     PERIOD,
     JointParameters,
     Reference,
-    Target,
     joint_torque,
     next_reference,
     reference_limits,
@@ -145,11 +144,10 @@ class ControlLoop:
         trajectories = trajectory_limits(limits, parameters)
         motion = PathMotion(self._joints, qpos.T) if name == "mimic" else RuckigMotion(trajectories, qpos.T)
         self._motion: ReferenceMotion = motion
-        self._stiffness, self._torque = np.ones(qpos.T.shape), np.zeros(qpos.T.shape)
+        self._torque = np.zeros(qpos.T.shape)
 
     def command(self, command: Command) -> None:
         """Takes a command for each robot, see `Driver`."""
-        self._stiffness = command.stiffness
         self._motion.command(command)
 
     def torque(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
@@ -159,8 +157,7 @@ class ControlLoop:
           qpos, qvel: measured [robots, joints] [rad, rad/s].
         """
         qpos, qvel, joints = qpos.T, qvel.T, self._joints
-        target = Target(qpos, self._stiffness)  # its value is of no use but in the mode "torque"
-        torque = joint_torque("joint_impedance", qpos, qvel, self._motion.next(), target, self._torque, joints, np)
+        torque = joint_torque("joint_position", qpos, qvel, self._motion.next(), qpos, self._torque, joints, np)
         is_leaving = (qvel > 0) & (qpos > joints.upper) | (qvel < 0) & (qpos < joints.lower)
         excess = np.where(is_leaving, qvel, qvel - np.clip(qvel, -self._slow, self._slow))
         torque = np.clip(torque - _SLOWING * joints.damping * excess, -joints.torque, joints.torque)
