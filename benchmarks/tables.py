@@ -1,11 +1,12 @@
 """Writes the tables of the pages that stem from results files.
 
-    python -m benchmarks.tables            # rewrites the tables between their marks in README.md and docs/
+    python -m benchmarks.tables            # rewrites the tables between their marks of all pages
     python -m benchmarks.tables --check    # changes nothing; exit code 1 where a page and its files differ
 
 A table stands between two marks: `<!-- table NAME: FILE.json ... -->` and `<!-- end -->`. NAME is a
 function of `arm_tables`, `policy_tables` or `speed_tables` in benchmarks/common, which makes the rows from the contents
-of the files; these are in benchmarks/results, or paths from the repository's root.
+of the files; these are in benchmarks/results, or paths from the repository's root. The page benchmarks/results/code.md
+says of each results file whether the code that it measures has changed since.
 """
 
 import argparse
@@ -15,18 +16,23 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common import arm_tables, policy_tables, speed_tables
+from benchmarks.common import arm_tables, measured_code, policy_tables, speed_tables
 from benchmarks.common.cells import Cells
 
 ROOT = Path(__file__).resolve().parents[1]
-FUNCTIONS = {**vars(arm_tables), **vars(policy_tables), **vars(speed_tables)}
+FUNCTIONS = {**vars(arm_tables), **vars(policy_tables), **vars(speed_tables), **vars(measured_code)}
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "benchmarks" / "results" / "code.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
 MARK = re.compile(r"<!-- table (\w+):([^>]*)-->\n.*?<!-- end -->", re.DOTALL)
 
 
 def read(name: str) -> Any:
     """The content of a results file, or a mapping from path to content for a pattern."""
     if "*" in name:
-        return {path.parent.name: json.loads(path.read_text()) for path in sorted(ROOT.glob(name))}
+        return {str(path.relative_to(ROOT)): json.loads(path.read_text()) for path in sorted(ROOT.glob(name))}
     path = ROOT / name if "/" in name else ROOT / "benchmarks" / "results" / name
     return json.loads(path.read_text())
 
@@ -53,7 +59,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="exit code 1 where a page and its files differ")
     check = parser.parse_args().check
     differing = []
-    for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
+    for page in PAGES:
         text = page.read_text()
         if (made := with_tables(text)) != text:
             differing.append(str(page.relative_to(ROOT)))

@@ -13,7 +13,7 @@ RESULTS = "benchmarks/results"
 
 def on_files(files: Files, *, config: Any) -> Files:
     """Adds the results, which are outside of docs, where the repository has them, and the data of the demo page."""
-    for path in sorted((REPOSITORY / RESULTS).glob("*.json")):
+    for path in sorted((REPOSITORY / RESULTS).glob("*.*")):
         files.append(File.generated(config, f"results/{path.name}", abs_src_path=str(path)))
     for name, script in demo_data.scripts().items():
         files.append(File.generated(config, f"demo/{name}.js", content=script))

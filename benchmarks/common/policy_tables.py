@@ -182,7 +182,8 @@ def policy_similarity(training: Results) -> list[Cells]:
     return rows
 
 
-def pretrained(reports: Results) -> list[Cells]:
+def pretrained(files: Results) -> list[Cells]:
+    reports = {path.split("/")[-2]: report for path, report in files.items()}
     policy, mapper = "policy: gap, training / held out", "mapper: gap"
     rows: list[Cells] = [("environment", policy, "distance / bound / copying", mapper, "distance / optimum / copying")]
     for env in ("panda3dof", "panda4dof", "panda7dof", "planar4dof", "planar7dof"):

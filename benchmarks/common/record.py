@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from benchmarks.common import measured_code
 from mimic.base.files import write_atomically
 from mimic.runs.files import finite
 from mimic.runs.provenance import hardware, versions
@@ -21,7 +22,7 @@ Row = dict[str, Any]
 
 
 def write_results(options: argparse.Namespace, **content: Any) -> None:
-    """Replaces the file of `--out`, if any, by this content with date, commit, hardware and versions."""
+    """Replaces the file of `--out`, if any, by this content with date, commit, code, hardware and versions."""
     if options.out is None:
         return
     process = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
@@ -29,6 +30,7 @@ def write_results(options: argparse.Namespace, **content: Any) -> None:
         "benchmark": options.benchmark,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="minutes"),
         "commit": options.commit or process.stdout.strip() or "unknown",
+        "code": measured_code.hashes(options.benchmark),
         "hardware": hardware(),
         "versions": {**versions(), "mink": importlib.metadata.version("mink")},
         **content,
