@@ -135,3 +135,20 @@ def _made_of(variables, program):
         if dependent.intersection(v for v in equation.invars if not hasattr(v, "val")):
             dependent.update(equation.outvars)
     return dependent
+
+
+@pytest.mark.parametrize("privileged", [False, True])
+def test_padded_inputs_change_no_output(privileged, monkeypatch):
+    config = PPOConfig(hidden_layers=[16], privileged_critic=privileged, network="mlp")
+    networks = ppo.make_networks(config, OBSERVED, ACTIONS)
+    statistics, policy, value = ppo.initial_params(networks, OBSERVED, jax.random.PRNGKey(0))
+    observation = jax.random.normal(jax.random.PRNGKey(1), (4, OBSERVED + privileged))
+
+    def outputs():
+        logits = networks.policy_network.apply(statistics, policy, observation[:, :OBSERVED])
+        return logits, networks.value_network.apply(statistics, value, observation)
+
+    expected = outputs()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert ppo._aligned(observation, -1).shape == (4, 8)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6), outputs(), expected)
