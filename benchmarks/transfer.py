@@ -6,6 +6,8 @@
     python -m benchmarks.transfer FOLDER ... --data DATA           # beside it: recorded teleoperation, again
 
 PYTHON is one with robosuite. FOLDER/NAME/NAME.xml are its arms with the Panda's gripper. The base is from `base=auto`.
+Rows of pairs are kept in DIR. Those of the same code are not measured again, so that processes with other arms or
+tasks share the work, and an interrupted run can be continued.
 
 The check is C MuJoCo's, of the written data set: hands are sites of both models, `exact` are frames within 1 mm and
 0.5 deg, `speed` is a fraction of the data sheets' limits, and `depth_mm` how deep links of the learner are in others;
@@ -21,12 +23,14 @@ In physics, `success` is robosuite's at the end. Beside mimic: seeded `ssik`, an
 """
 
 import argparse
+import functools
 import json
 import os
+import shutil
 import subprocess
 import time
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +38,14 @@ import h5py
 import mujoco
 import numpy as np
 
+from benchmarks.common import measured_code
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.exact_hands import SPEEDS, as_numbers, followed_by_ssik, homogeneous
 from benchmarks.teleoperation import BASE, SPEED, arm, hand_errors, recordings
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.compile_check import VELOCITY_LIMIT
+from mimic.base.files import write_atomically
 from mimic.commands.config import RetargetConfig
 from mimic.commands.retarget import prepare_retargeting
 from mimic.envs.config import EnvConfig
@@ -101,6 +107,7 @@ def with_speeds(folder: str, name: str) -> Path:
 
 def retarget(source: Path, expert: Path, learner: Path, out: Path, base: Any) -> dict[str, Any]:
     """The report of the command, and its seconds."""
+    shutil.rmtree(out, ignore_errors=True)  # of an interrupted run
     env = EnvConfig(expert=ArmConfig(model=str(expert)), learner=ArmConfig(model=str(learner)))
     began = time.perf_counter()
     work = prepare_retargeting(RetargetConfig(source=str(source), env=env, out=str(out), base=base, failing="kept"))
@@ -247,6 +254,16 @@ def in_physics(options: argparse.Namespace, expert: Model, rows: list[Row]) -> l
     return [{"learner": result["robot"], **{key: result[key] for key in keys}} for result in results]
 
 
+def kept(options: argparse.Namespace, path: Path, measure: Callable[[], Row]) -> Row:
+    """A row from its file if that is of the same code, or measured and written there."""
+    code = measured_code.hashes(options.benchmark)
+    if path.exists() and (row := json.loads(path.read_text())).pop("code") == code:
+        return row
+    row = measure()
+    write_atomically(path, json.dumps({**row, "code": code}))
+    return row
+
+
 def main(arguments: list[str] | None = None) -> None:
     parser = make_parser(
         "transfer", __doc__, demonstrations="../shared/data/robosuite_demos", work="transfer", arms=ARMS, tasks=TASKS,
@@ -259,11 +276,13 @@ def main(arguments: list[str] | None = None) -> None:
     for name in options.arms:
         learner = Model(Path(options.folder) / name / f"{name}.xml")
         for task in options.tasks:
-            content["pairs"].append(pair_row(options, expert, name, learner, task))
+            measure = functools.partial(pair_row, options, expert, name, learner, task)
+            content["pairs"].append(kept(options, Path(options.work) / f"{task}_{name}.json", measure))
             write_results(options, **content)
             print_table(content["pairs"][-1:], PAIRS)
         if "lift" in options.tasks and len(learner.range) == _WITHOUT_REDUNDANCY:
-            content["round_trip"].append(round_trip(options, expert, name))
+            measure = functools.partial(round_trip, options, expert, name)
+            content["round_trip"].append(kept(options, Path(options.work) / f"round_trip_{name}.json", measure))
     if options.data:
         content["teleoperation"] = list(teleoperation(options))
     if options.physics:

@@ -20,13 +20,14 @@ from mimic.metric.kinematics import link_state_table
 from mimic.retargeting.base_placement import POSITION_ALONE, best_bases, repeated
 from mimic.retargeting.certificate import POSITION, ROTATION
 from mimic.retargeting.clearance import make_clearance
+from mimic.retargeting.hand_speeds import speeds_needed
+from mimic.retargeting.hand_target import Placement
 from mimic.retargeting.pose import imitate_pose
 
 _POSES, _DRAWN = 1024, 4096  # of the expert: those that are compared, and from which they are chosen
 _FRAMES = 16  # of them, that a base is searched with
 _TOUCHING = -0.01  # m: capsules are larger than the shapes that they contain
 _NO_FLOOR = -1e3  # m; what the arm stands on is not known
-_STEP = 1e-5  # rad, of the differences that give a hand's velocity
 _KINDS = ("exact", "position alone", "not reached")
 _COLOURS = ("tab:green", "tab:orange", "tab:red")
 _WORST = 5  # percent of the poses
@@ -94,7 +95,8 @@ def hand_reach(expert: ArmConfig, learner: ArmConfig, metric: MetricConfig, base
     built = metric.build(*pair)
     bases = np.zeros((1, 4)) if base is None or isinstance(base, str) else np.reshape(base, (1, 4))
     if isinstance(base, str):
-        found = best_bases(*pair, qpos[:_FRAMES], built)
+        frames, limit = qpos[:_FRAMES], finite_velocity_limit(pair[1])
+        found = best_bases(*pair, frames, np.zeros_like(frames), built, jump=limit)
         bases = np.concatenate([bases, np.round(found, 3)])
     reached = [_reach(pair, built, qpos, base) for base in bases]
     reach, postures = max(reached, key=lambda result: result[0].score)
@@ -135,51 +137,30 @@ def _reach(
     pair: tuple[Embodiment, Embodiment], metric: Metric, qpos: np.ndarray, base: np.ndarray
 ) -> tuple[HandReach, np.ndarray]:
     """The hands from one base, and the learner's postures [rad]; whether these touch is left open."""
-    solution = imitate_pose(*pair, qpos, **metric.arguments, hand="exact", base=repeated(base[None], len(qpos)))
+    placements = repeated(base[None], len(qpos))
+    solution = imitate_pose(*pair, qpos, **metric.arguments, hand="exact", base=placements)
     postures, error = jax.device_get((solution.qpos, solution.hand))
     hand = link_state_table(pair[0], qpos, np.zeros_like(qpos)).hand
     assert hand is not None
     is_exact = (error.position <= POSITION) & (error.rotation <= ROTATION)
-    speed = np.where(error.position <= POSITION, _speed(pair, qpos, postures, base[3], is_exact), np.nan)
+    speed = np.where(error.position <= POSITION, _speed(pair, qpos, postures, placements, is_exact), np.nan)
     hands = np.asarray(hand.position) * float(pair[0].chain_length)
     return HandReach(base, hands, error.position, error.rotation, speed, None), postures
 
 
 def _speed(
-    pair: tuple[Embodiment, Embodiment], qpos: np.ndarray, postures: np.ndarray, yaw: float, is_exact: np.ndarray
+    pair: tuple[Embodiment, Embodiment], qpos: np.ndarray, postures: np.ndarray, base: Placement, is_exact: np.ndarray
 ) -> Float[np.ndarray, " poses"]:
     """Fraction of the expert's speed, at most 1, at which no joint of the learner exceeds its velocity limit.
 
     The expert moves in a random direction, with a joint at its limit. The learner's hand has its velocity, or its
     linear velocity alone where the rotation is not exact, with least squares of its joints' speeds in their limits.
     """
-    limits = [finite_velocity_limit(arm) for arm in pair]
     direction = np.random.default_rng(1).uniform(-1, 1, qpos.shape)
     direction /= np.abs(direction).max(axis=1, keepdims=True)
-    of_expert, of_learner = (
-        _jacobians(arm, q) * limit for arm, q, limit in zip(pair, (qpos, postures), limits, strict=True)
-    )
-    twist = np.einsum("phrj,pj->phr", of_expert, direction)
-    cosine, sine = np.cos(yaw), np.sin(yaw)
-    turn = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1.0]])  # into the axes of the learner's base
-    twist = np.concatenate([twist[..., :3] @ turn.T, twist[..., 3:] @ turn.T], axis=-1)
-    counts = np.where(is_exact[:, None, None, None], 1.0, np.repeat([1.0, 0.0], 3)[:, None])
-    rows = (len(qpos), -1, pair[1].num_joints)
-    needed = np.linalg.pinv((counts * of_learner).reshape(rows), rcond=1e-6)
-    needed = np.einsum("pjr,pr->pj", needed, (counts[..., 0] * twist).reshape(len(qpos), -1))
-    return 1 / np.maximum(np.abs(needed).max(axis=1), 1)
-
-
-def _jacobians(arm: Embodiment, qpos: np.ndarray) -> Float[np.ndarray, "poses hands 6 joints"]:
-    """Linear [m] and angular velocity [rad] of the hands for each joint's velocity."""
-    unit = np.eye(arm.num_joints)
-    steps = np.asarray(qpos, float)[:, None, None] + _STEP * np.stack([-unit, unit], axis=1)
-    moved = link_state_table(arm, steps, np.zeros_like(steps), float).hand
-    here, speeds = np.broadcast_arrays(qpos[:, None].astype(float), unit)
-    turned = link_state_table(arm, here, speeds, float).hand
-    assert moved is not None and turned is not None
-    linear = np.diff(moved.position, axis=2)[:, :, 0] * float(arm.chain_length) / (2 * _STEP)
-    return np.moveaxis(np.concatenate([linear, turned.angular_velocity], axis=-1), 1, -1)
+    of_expert, of_learner = (finite_velocity_limit(arm) for arm in pair)
+    needed = speeds_needed(*pair, qpos, direction * of_expert, postures, base, of_learner, is_exact.astype(float))
+    return 1 / np.maximum(needed, 1)
 
 
 def _typical(values: np.ndarray, *, lowest: bool = False) -> list[float] | None:

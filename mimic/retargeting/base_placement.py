@@ -5,12 +5,13 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints
 from mimic.metric.distance import NO_HAND, Correspondence, HandWeights, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import hand_frames
+from mimic.retargeting.hand_speeds import speeds_needed
 from mimic.retargeting.hand_target import POSITION_TOLERANCE, Placement, placement
 from mimic.retargeting.pose import checked_poses, imitate_pose
 from mimic.retargeting.trajectory import imitate_trajectory
@@ -19,8 +20,10 @@ _FRAMES, _BASES, _ROUNDS = 24, 64, 3  # frames that judge a base, bases in each 
 _SPREAD = np.array([0.5, 0.5, 0.2, np.pi])  # of the first round: chain lengths of the expert, and rad
 _NARROWER = 0.35  # factor of the spread from one round to the next
 _SEARCHES = 3  # at most
+_FAST = 0.1  # of the poses: the fastest, from which a third of the frames are chosen
 _BEST = 4  # bases that the next round starts from, and that are checked on a whole motion at the end
-# Of the score: room in the joint ranges, embodiment distance, and the hand's position alone; an exact hand has 1.
+# Of the score: room in the joint ranges and below the velocity limits, embodiment distance, and hands whose position
+# alone is exact, or that are too fast; an exact hand has 1.
 _ROOM, _DISTANCE, POSITION_ALONE = 0.2, 0.3, 0.3
 
 
@@ -37,11 +40,12 @@ def find_base(
     largest_jump: Float[ArrayLike, " learner_joints"] | float = 0.3,
     seed: int = 0,
 ) -> Float[np.ndarray, "4"]:
-    """The base [x, y, z, yaw] of the learner from which most hands are exact, with room in the joint ranges.
+    """The base [x, y, z, yaw] of the learner from which most hands are exact, with room in the joints' limits.
 
-    A random search that narrows in three rounds judges bases by frames of all motions. Of the best ones the first
-    is taken from which the whole longest motion is exact, within `largest_jump`. Where it is from none, the search
-    goes on with frames that were not exact among those that judge, and at last the base is taken from which most are.
+    A random search that narrows in three rounds judges bases by frames of all motions, a third of them among the
+    fastest, and by the speeds that these need of the joints. Of the best bases the first is taken from which the whole
+    longest motion is exact, within `largest_jump`. Where it is from none, the search goes on with frames that were not
+    exact among those that judge, and at last the base is taken from which most are.
 
     Args:
       expert: n joints.
@@ -62,11 +66,19 @@ def find_base(
     if not len(motions):
         raise ValueError("motions: expected at least one, got none")
     paths = [checked_poses(expert, np.asarray(motion, np.float32), "motions", axes=("time",)) for motion in motions]
-    poses, longest = np.concatenate(paths), max(paths, key=len)
+    paths = sorted(paths, key=len, reverse=True)
+    poses, longest = np.concatenate(paths), paths[0]
+    steps = np.concatenate([np.diff(path, axis=0, append=path[-1:]) for path in paths])
+    jump = np.broadcast_to(np.asarray(largest_jump, float), (learner.num_joints,))
     metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
-    frames, start, best = spread_poses(expert, poses, _FRAMES), np.zeros((1, 4)), (-1.0, np.zeros(4))
+    places, part = _places(expert, poses), _FRAMES // 3
+    speed = np.linalg.norm(_places(expert, poses + steps) - places, axis=1)
+    fast = _spread(places, np.flatnonzero(speed >= np.quantile(speed, 1 - _FAST)), part)
+    judged = np.concatenate([_spread(places, np.arange(len(poses)), _FRAMES - part), fast])
+    start, best = np.zeros((1, 4)), (-1.0, np.zeros(4))
     for search in range(_SEARCHES):
-        bases = best_bases(expert, learner, frames, metric, seed=seed + search, start=start)
+        frames = poses[judged], steps[judged]
+        bases = best_bases(expert, learner, *frames, metric, jump=jump, seed=seed + search, start=start)
         for base in bases:
             motion = imitate_trajectory(
                 expert, learner, longest, hand="exact", largest_jump=largest_jump, base=base, **metric.arguments
@@ -74,47 +86,61 @@ def find_base(
             assert motion.hand is not None
             exact = np.asarray(motion.hand.exact)
             if exact.mean() > best[0]:
-                best, failing = (float(exact.mean()), base), longest[~exact]
+                best, failing = (float(exact.mean()), base), np.flatnonzero(~exact)
             if exact.all():
                 return base
         start = best[1][None]
-        hard = spread_poses(expert, failing, _FRAMES // 3)
-        frames = np.concatenate([spread_poses(expert, poses, _FRAMES - len(hard)), hard])
+        judged = np.concatenate([judged[:part], fast, _spread(places, failing, part)])
     return best[1]
 
 
-def spread_poses(
-    arm: Embodiment, qpos: Float[np.ndarray, "poses joints"], count: int
-) -> Float[np.ndarray, "count joints"]:
-    """The poses whose hands are farthest from each other, so that none is far from one of them.
-
-    Each next pose is the one with the greatest distance of its hand from those before, a metre counting as 1.4 radians.
-    """
+def _places(arm: Embodiment, qpos: Float[np.ndarray, "poses joints"]) -> Float[np.ndarray, "poses numbers"]:
+    """Positions and axes of the hands, of which a metre counts as 1.4 radians."""
     hands = jax.device_get(jax.jit(jax.vmap(lambda pose: hand_frames(arm, pose)))(qpos))
-    places = np.concatenate([hands.position.reshape(len(qpos), -1), hands.rotation.reshape(len(qpos), -1) / 2], axis=1)
-    chosen, nearest = [0], np.full(len(qpos), np.inf)
+    return np.concatenate([hands.position.reshape(len(qpos), -1), hands.rotation.reshape(len(qpos), -1) / 2], axis=1)
+
+
+def _spread(places: np.ndarray, among: Int[np.ndarray, " chosen"], count: int) -> Int[np.ndarray, " count"]:
+    """Those of some poses whose hands are farthest from each other, so that none is far from one of them.
+
+    Each next pose is the one with the greatest distance of its hand from those before.
+    """
+    places = places[among]
+    chosen, nearest = [0], np.full(len(places), np.inf)
     while len(chosen) < count:
         nearest = np.minimum(nearest, np.linalg.norm(places - places[chosen[-1]], axis=1))
         chosen.append(int(nearest.argmax()))
-    return qpos[chosen]
+    return among[chosen]
 
 
 def best_bases(
     expert: Embodiment,
     learner: Embodiment,
     frames: Float[np.ndarray, "frames joints"],
+    steps: Float[np.ndarray, "frames joints"],
     metric: Metric,
     *,
+    jump: Float[np.ndarray, " learner_joints"],
     seed: int = 0,
     start: Float[np.ndarray, "bases 4"] = np.zeros((1, 4)),  # noqa: B008
 ) -> Float[np.ndarray, "bases 4"]:
-    """The best bases near some that are found for single poses of the expert [rad], the best first; see `find_base`."""
+    """The best bases near some that are found for single poses of the expert [rad], the best first; see `find_base`.
+
+    Args:
+      expert, learner: the arms.
+      frames: poses of the expert [rad].
+      steps: its changes from these to the next times [rad], zero where no speed is asked for.
+      metric: see `find_base`.
+      jump: maximum change of the learner's joints in this time [rad].
+      seed: of the search.
+      start: bases near which it begins.
+    """
     generator, spread = np.random.default_rng(seed), _SPREAD * np.array([*[float(expert.chain_length)] * 3, 1.0])
     bases, scores = start, np.full(len(start), -np.inf)
     for _ in range(_ROUNDS):
         new = bases[np.arange(_BASES) % len(bases)] + generator.uniform(-spread, spread, (_BASES, 4))
         new[0] = bases[0]
-        of_new = _scores(expert, learner, frames, new, metric)
+        of_new = _scores(expert, learner, frames, steps, new, metric, jump)
         bases, scores = np.concatenate([bases, new]), np.concatenate([scores, of_new])
         order = np.argsort(-scores, kind="stable")[:_BEST]
         bases, scores, spread = bases[order], scores[order], spread * _NARROWER
@@ -131,16 +157,20 @@ def _scores(
     expert: Embodiment,
     learner: Embodiment,
     frames: Float[np.ndarray, "frames joints"],
+    steps: Float[np.ndarray, "frames joints"],
     bases: Float[np.ndarray, "bases 4"],
     metric: Metric,
+    jump: Float[np.ndarray, " learner_joints"],
 ) -> Float[np.ndarray, " bases"]:
     """Scores of bases: the mean over the frames of exact hands, room, and distance, or of positions."""
     poses, count = np.tile(frames, (len(bases), 1)), len(bases)
+    steps = np.tile(steps, (count, 1))
     stacked = repeated(bases, len(frames))
     solution = jax.device_get(imitate_pose(expert, learner, poses, hand="exact", base=stacked, **metric.arguments))
     lower, upper = np.asarray(learner.joint_range).T
     room = 2 * np.minimum(solution.qpos - lower, upper - solution.qpos) / (upper - lower)
-    room = np.where(continuous_joints(learner), 1, room).min(axis=-1)
+    speed = speeds_needed(expert, learner, poses, steps, np.asarray(solution.qpos), stacked, jump)
+    room = np.minimum(np.where(continuous_joints(learner), 1, room).min(axis=-1), 1 - speed)
     score = np.where(solution.hand.position <= POSITION_TOLERANCE, POSITION_ALONE, 0)
-    score = np.where(solution.hand.exact, 1 + _ROOM * room - _DISTANCE * solution.distance, score)
+    score = np.where(solution.hand.exact & (speed <= 1), 1 + _ROOM * room - _DISTANCE * solution.distance, score)
     return score.reshape(count, -1).mean(axis=-1)

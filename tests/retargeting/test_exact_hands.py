@@ -11,9 +11,10 @@ from mimic.arms.embodiment import Embodiment, panda, panda_path, planar_arm
 from mimic.metric.config import MetricConfig
 from mimic.metric.distance import embodiment_distance
 from mimic.metric.kinematics import link_states
-from mimic.retargeting.base_placement import find_base
+from mimic.retargeting.base_placement import find_base, repeated
 from mimic.retargeting.exact_chunks import in_chunks
 from mimic.retargeting.exact_trajectory import Candidates, best_path, within_ranges
+from mimic.retargeting.hand_speeds import speeds_needed
 from mimic.retargeting.hand_target import (
     POSITION_TOLERANCE,
     ROTATION_TOLERANCE,
@@ -274,6 +275,17 @@ def test_a_base_is_found_from_which_a_small_arm_follows():
         for b in (None, base)
     ]
     assert exact[0] < 0.5 and exact[1] == 1
+
+
+def test_speeds_that_a_hand_needs_are_those_of_the_joints_of_a_planar_arm():
+    """Of the same arm with a rotated base, whose three joints have no choice for a hand in the plane."""
+    qpos, limit = planar_poses(20), np.array([1.0, 2.0, 0.5])
+    qvel = np.random.default_rng(1).uniform(-1, 1, qpos.shape)
+    base, postures = repeated(np.array([[0.0, 0.0, 0.0, 0.4]]), 20), qpos - np.array([0.4, 0, 0])
+    needed = speeds_needed(EXPERT, EXPERT, qpos, qvel, postures, base, limit)
+    np.testing.assert_allclose(needed, np.abs(qvel / limit).max(axis=1), rtol=1e-4)  # of angles in single precision
+    shift = repeated(np.array([[0.3, -0.2, 0.1, 0.4]]), 20)  # of the base, which changes no velocity
+    np.testing.assert_array_equal(needed, speeds_needed(EXPERT, EXPERT, qpos, qvel, postures, shift, limit))
 
 
 @pytest.mark.parametrize("count", [1, 3, 4, 5, 8, 9])
