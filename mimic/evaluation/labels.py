@@ -1,5 +1,6 @@
 """Keys and display names of splits, measures of similarity and baselines."""
 
+import math
 from collections.abc import Mapping
 
 SPLITS = ("train", "held_out")
@@ -23,10 +24,12 @@ SIMILARITY_NAMES = {  # display names that differ from their keys
 
 
 def similarity_texts(similarity: Mapping[str, float]) -> dict[str, tuple[str, str]]:
-    """Label and value of each measure of one moment by the measure's name, as the viewer and videos show them."""
+    """Label and value of each known measure of one moment by its name, as the viewer and videos show them."""
 
     def text(name: str) -> str:
         return f"{similarity[name]:.0f}°" if name.endswith("_deg") else f"{similarity[name]:.3f}"
 
-    headers = SIMILARITY_HEADERS.items()
-    return {name: (header.replace("\n", " "), text(name)) for name, header in headers if name in similarity}
+    known = {
+        name: header for name, header in SIMILARITY_HEADERS.items() if not math.isnan(similarity.get(name, math.nan))
+    }
+    return {name: (header.replace("\n", " "), text(name)) for name, header in known.items()}

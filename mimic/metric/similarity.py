@@ -282,10 +282,10 @@ def _with_chain(line: CentreLine) -> CentreLine:
 
 
 def _norm(vectors: Any) -> Any:
-    """Length along the last axis, with derivative 0 at 0."""
+    """Length along the last axis, with derivative 0 at 0; NaN where an entry is."""
     numpy = array_library(vectors)
     square = (vectors * vectors).sum(axis=-1)
-    return numpy.where(square > 0, numpy.sqrt(numpy.where(square > 0, square, 1)), 0)
+    return numpy.where(square == 0, 0, numpy.sqrt(numpy.where(square == 0, 1, square)))
 
 
 def _angle(a: Any, b: Any) -> Any:

@@ -1,5 +1,6 @@
 """The progress bar of a training, and the tables of a report."""
 
+import math
 import os
 import time
 from collections.abc import Mapping
@@ -101,6 +102,8 @@ def similarity_table(
 
 
 def _similarity_cell(key: str, value: float) -> str:
+    if math.isnan(value):  # of an arm without a hand
+        return "-"
     return f"{value:.1f} deg" if key.endswith("_deg") else f"{value:.3f}"
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic.arms.embodiment import panda, panda_path, planar_arm
+from mimic.arms.embodiment import panda, panda_path, planar_arm, without_hands
 from mimic.metric import similarity
 from mimic.metric.similarity import MEASURES, centre_line, centre_line_table
 
@@ -155,3 +155,9 @@ def test_the_rotation_of_hands_sees_the_last_joint_and_has_no_kink_that_is_nan()
     assert np.isfinite(
         jax.grad(lambda qpos: similarity.hand_rotation(line, centre_line(arm, qpos)))(pose)
     ).all()  # a match to the bit
+
+
+def test_the_rotation_to_an_arm_without_a_hand_is_not_known():
+    pose = np.full(7, 0.3, np.float32)
+    lines = [centre_line_table(arm, pose) for arm in (panda(), without_hands(panda()))]
+    assert np.isnan(similarity.similarity(*lines)["hand_rotation_deg"])
