@@ -102,13 +102,39 @@ def errors(arm: Embodiment, qpos: np.ndarray, targets: np.ndarray) -> tuple[np.n
     return np.linalg.norm(apart[..., :3, 3], axis=-1), 2 * np.arcsin(np.minimum(chord, 1))
 
 
-def closed_form(arm: Embodiment) -> Callable[..., np.ndarray | None]:
-    """ssik: from a hand pose [4, 4] and a seed to the nearest solution, None where there is none."""
+def jacobians(arm: Embodiment, qpos: np.ndarray) -> np.ndarray:
+    """Velocities [..., 6, joints] of the hand, linear [m] and angular, for each joint's."""
+    hand, columns, before = hand_matrices(arm, qpos)[..., :3, 3], [], np.eye(4)
+    for motion, axis, anchor in zip(joint_motions(arm, qpos), arm.joint_axis, arm.joint_anchor, strict=True):
+        axis, origin = motion[..., :3, :3] @ axis, (before @ np.append(anchor, 1))[..., :3]
+        columns.append(np.concatenate([np.cross(axis, hand - origin), axis], axis=-1))
+        before = motion
+    return np.stack(columns, axis=-1)
+
+
+def ssik_solver(arm: Embodiment) -> tuple[Any, np.ndarray]:
+    """ssik's arm, and the rotation from its hand to ours."""
     import ssik
 
     points = np.concatenate([np.zeros((1, 3)), arm.joint_anchor, arm.hand_position])
     solver = ssik.Manipulator.from_axes(arm.joint_axis, np.diff(points, axis=0), limits=arm.joint_range)
-    back = homogeneous(arm.hand_rotation[0].T, np.zeros(3))
+    return solver, homogeneous(arm.hand_rotation[0].T, np.zeros(3))
+
+
+def all_postures(arm: Embodiment) -> Callable[[np.ndarray], np.ndarray]:
+    """ssik: from a hand pose [4, 4] to the postures [postures, joints] of all branches; samples of a redundant arm."""
+    solver, back = ssik_solver(arm)
+
+    def solve(target: np.ndarray) -> np.ndarray:
+        solutions = solver.solve(target @ back, enumerate_windings=False)
+        return np.reshape([solution.q for solution in solutions], (-1, arm.num_joints))
+
+    return solve
+
+
+def closed_form(arm: Embodiment) -> Callable[..., np.ndarray | None]:
+    """ssik: from a hand pose [4, 4] and a seed to the nearest solution, None where there is none."""
+    solver, back = ssik_solver(arm)
 
     def solve(target: np.ndarray, seed: np.ndarray | None = None) -> np.ndarray | None:
         solutions = solver.solve(target @ back, q_seed=seed, max_solutions=1, enumerate_windings=seed is not None)

@@ -16,10 +16,10 @@ from mimic.retargeting.hand_target import POSITION_TOLERANCE, Placement, placeme
 from mimic.retargeting.pose import checked_poses, imitate_pose
 from mimic.retargeting.trajectory import imitate_trajectory
 
-_FRAMES, _BASES, _ROUNDS = 24, 64, 3  # frames that judge a base, bases in each round of the search, and rounds
+_FRAMES, _BASES, _ROUNDS = 36, 64, 3  # frames that judge a base, bases in each round of the search, and rounds
 _SPREAD = np.array([0.5, 0.5, 0.2, np.pi])  # of the first round: chain lengths of the expert, and rad
 _NARROWER = 0.35  # factor of the spread from one round to the next
-_SEARCHES = 3  # at most
+_SEARCHES = 5  # at most
 _FAST = 0.1  # of the poses: the fastest, from which a third of the frames are chosen
 _BEST = 4  # bases that the next round starts from, and that are checked on a whole motion at the end
 # Of the score: room in the joint ranges and below the velocity limits, embodiment distance, and hands whose position
