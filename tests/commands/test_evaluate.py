@@ -15,7 +15,7 @@ from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs import imitation
 from mimic.envs.config import DemonstrationConfig
 from mimic.envs.imitation import training_and_held_out
-from mimic.evaluation import evaluator
+from mimic.evaluation import references
 from mimic.motions.experts import KINDS
 from mimic.physics import step as physics
 from mimic.runs.checkpoints import save_checkpoint
@@ -52,7 +52,7 @@ def evaluate(run_dir, out, **settings):
 def test_holding_the_start_pose_has_a_gap_of_one(run_dir, tmp_path, monkeypatch):
     """Whatever the bound. 1e-5: float32, once from rollouts and once from the home pose."""
     bound = np.zeros((COUNT + HELD_OUT, HORIZON)), np.zeros((COUNT + HELD_OUT, HORIZON, 2))
-    monkeypatch.setattr(evaluator, "_lower_bound", lambda *_: bound)
+    monkeypatch.setattr(references, "_lower_bound", lambda *_: bound)
     report, rows = evaluate(run_dir, tmp_path / "new", controller="hold", physics="fused", mass=1.5)
     assert report["physics"] == "fused" and "mjx" not in report
     assert report["trainer"] == "hold" and report["evaluated"]["mass"] == [1.5, 1.5]
