@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, cast
@@ -103,6 +103,22 @@ def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     """Raises a ValueError that lists the choices if the value is none of them."""
     if value not in choices:
         raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r:.80}{suggestion(value, choices)}")
+
+
+def check_unused(config: Any, keys: Collection[str], reason: str, prefix: str = "") -> None:
+    """Raises a ValueError for the first key of a config that has another value than its default, and no effect.
+
+    Args:
+      config: a dataclass.
+      keys: names of fields that have no effect.
+      reason: what follows "expected none", such as "with run=DIR".
+      prefix: of the keys in the message.
+    """
+    for field in dataclasses.fields(config):
+        factory, value = field.default_factory, getattr(config, field.name)
+        default = field.default if factory is dataclasses.MISSING else factory()
+        if field.name in keys and value != default:
+            raise ValueError(f"{prefix}{field.name}: expected none {reason}, got {value!r:.80}")
 
 
 def new_file(name: str, path: str) -> Path:

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.arms.link_match import LinkMatch
+from mimic.base.config import check_unused
 from mimic.commands.config import RenderConfig
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
@@ -94,7 +95,7 @@ def prepare_clip(config: RenderConfig) -> ClipPlan:
 def _policy_clip(config: RenderConfig) -> ClipPlan:
     """A policy's rollout, with the kinematic bound and the distance of holding the start pose."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
-    _check_unused(config, "run=DIR", "demonstrations", "expert", "limits")
+    check_unused(config, ("demonstrations", "expert", "limits"), "with run=DIR")
     trained, trainer = make_policy_trainer(trained, run_dir, config.learner, config.locked)
     index = demonstration_index(trainer.evaluator, config.split, config.demonstration)
     _, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
@@ -123,7 +124,7 @@ def _policy_clip(config: RenderConfig) -> ClipPlan:
 
 def _retargeted_clip(config: RenderConfig) -> ClipPlan:
     """A demonstration of the expert, and the learner's motion that `mimic.retarget` computed from it."""
-    _check_unused(config, "retargeted=FILE", "run", "checkpoint", "split", "locked")
+    check_unused(config, ("run", "checkpoint", "split", "locked"), "with retargeted=FILE")
     for key, example in (("demonstrations", "EXPERT.npz"), ("retargeted", "LEARNER.npz"), ("learner", "panda4dof")):
         if not getattr(config, key):
             raise ValueError(f"{key}: expected with retargeted=FILE, as in {key}={example}")
@@ -198,11 +199,3 @@ def _check_arm(key: str, motions: Demonstrations, arm: Embodiment) -> None:
 def _check_number(number: int, motions: Demonstrations) -> None:
     if not 0 <= number < motions.count:
         raise ValueError(f"demonstration: expected an index of the file from 0 to {motions.count - 1}, got {number}")
-
-
-def _check_unused(config: RenderConfig, source: str, *keys: str) -> None:
-    """Rejects keys that have no effect with this source of motions."""
-    defaults = RenderConfig()
-    for key in keys:
-        if getattr(config, key) != getattr(defaults, key):
-            raise ValueError(f"{key}: has no effect with {source}; expected none, got {getattr(config, key)!r}")

@@ -11,7 +11,7 @@ from typing import Any
 from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import LIMITS
 from mimic.arms.named_arms import BUILT_IN, is_arm_name
-from mimic.base.config import check_choice
+from mimic.base.config import check_choice, check_unused
 from mimic.base.ranges import check_ranges, checkpoint_number, number, seed_number
 from mimic.commands.arm_keys import arm_of_environment
 from mimic.envs import environments
@@ -100,8 +100,7 @@ class EvaluateConfig:
     def _check_robot(self) -> None:
         """Raises a `ValueError` for options of another kind of evaluation."""
         if not self.robot:
-            if self.robot_world or self.robot_loop != "mimic" or self.edges:
-                raise ValueError("robot_world, robot_loop, edges: expected only with robot=, as in robot=virtual_panda")
+            check_unused(self, ("robot_world", "robot_loop", "edges"), "without robot=, as in robot=virtual_panda")
             return
         check_choice("robot", self.robot, ROBOTS)
         check_choice("robot_loop", self.robot_loop, ROBOT_LOOPS)
@@ -111,12 +110,8 @@ class EvaluateConfig:
             raise ValueError(
                 f"controller: expected {' or '.join(ROBOT_CONTROLLERS)} with robot=, got {self.controller}"
             )
-        others = self.learner, self.physics, self.mass, self.damping, self.torque_noise
-        if any(value not in ("", None) for value in others):
-            raise ValueError(
-                "learner, physics, mass, damping, torque_noise: expected none with robot=, whose world has ranges of "
-                "them"
-            )
+        others = "learner", "physics", "mass", "damping", "torque_noise"
+        check_unused(self, others, "with robot=, whose world has ranges of masses, damping and friction")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -465,14 +460,14 @@ class ViewConfig:
             raise ValueError(f"run, mapper: expected one of them, got {self.run!r} and {self.mapper!r}")
         if self.learners and not self.mapper:
             raise ValueError("learners: expected with mapper=, as in mapper=any_arm learners=[panda,ur5e.xml]")
-        if self.source and (self.run or self.mapper):
-            raise ValueError("run, mapper: expected none with source=, whose person is the expert")
-        if not self.source and (self.arm or self.capture != CaptureConfig()):
-            raise ValueError("arm, capture: expected only with source=")
+        if self.source:
+            check_unused(self, ("run", "mapper", "demonstrations"), "with source=, whose person is the expert")
+        else:
+            check_unused(self, ("arm", "capture"), "without source=")
         if self.arm:
             check_choice("arm", self.arm, ARM_SIDES)
-        if self.demonstrations and (self.run or self.source):
-            raise ValueError("demonstrations: expected none with run= or source=, whose motions are shown")
+        if self.run:
+            check_unused(self, ("demonstrations",), "with run=, whose motions are shown")
         check_choice("hand", self.hand, _FOLLOWED)
         if self.hand != "free" and (self.run or self.mapper):
             raise ValueError("hand: expected free with run= or mapper=, which move the learner")

@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 
 from mimic.base.compilation import use_compilation_cache
-from mimic.base.config import new_folder
+from mimic.base.config import check_unused, new_folder
 from mimic.base.distribution import NAME, VERSION
 from mimic.commands.config import DatasetConfig
 from mimic.commands.dataset_sources import file_episodes, rollout_episodes
@@ -61,11 +61,10 @@ def _check_keys(config: DatasetConfig) -> None:
         raise ValueError(
             f"run, demonstrations: expected one of them, as in run=runs/NAME or demonstrations=FILE.npz, got {got}"
         )
-    for key in ("checkpoint", "split"):
-        if not config.run and getattr(config, key) not in ("", None):
-            raise ValueError(f"{key}: expected only with run=, got {getattr(config, key)!r}")
-    if config.retargeted and config.run:
-        raise ValueError(f"retargeted: expected only with demonstrations=, got {config.retargeted!r}")
+    if config.run:
+        check_unused(config, ("retargeted",), "with run=DIR")
+    else:
+        check_unused(config, ("checkpoint", "split"), "without run=DIR")
 
 
 def _check_package(format: str) -> None:

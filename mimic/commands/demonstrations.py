@@ -13,7 +13,7 @@ from rich.table import Table
 from mimic.arms.arm import Arm, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.arms.embodiment import Embodiment
-from mimic.base.config import new_file
+from mimic.base.config import check_unused, new_file
 from mimic.commands.capture import MOTION_CAPTURE, prepare_capture
 from mimic.commands.config import RecordingConfig
 from mimic.commands.demonstrations_plot import plot_demonstrations
@@ -25,6 +25,8 @@ from mimic.retargeting.self_collision import smallest_clearances, touching_line
 from mimic.trainers.progress import is_animated
 
 _PLOT_SUFFIXES = (".png", ".pdf", ".svg")
+_OF_SOURCE = "joints", "topic", "units", "rate"  # keys of a source of motions
+_NOT_RECORDED = "with source=FILE, whose motions are not recorded"
 
 
 def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
@@ -38,16 +40,12 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
     out, plot = _files(config)
     env, console = config.resolve(), Console()
     if config.source and (config.arm or Path(config.source).suffix.lower() in MOTION_CAPTURE):
-        _check_unused(config, "kind", "count", "seed", "limits", "joints", "topic", "units", "rate")
+        check_unused(config, ("kind", "count", "seed", "limits", *_OF_SOURCE), _NOT_RECORDED)
         return prepare_capture(config, env, out, plot)
     arm = build_arm(env.expert, env.limits)
     if config.source:
         return _prepare_import(config, env, arm, out, plot)
-    if config.joints:
-        raise ValueError("joints: expected only with source=FILE, as the names of its joints")
-    for key in ("topic", "units", "rate"):
-        if getattr(config, key):
-            raise ValueError(f"{key}: expected only with source=, got {getattr(config, key)!r}")
+    check_unused(config, _OF_SOURCE, "without source=FILE")
     demonstrations, redrawn = _record(arm, env, console)
     check_effort(demonstrations, arm.embodiment)  # of the exact arrays to be written
 
@@ -68,7 +66,7 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
 
 def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path, plot: Path) -> Callable[[], None]:
     """Imports motions; the returned function writes and plots them."""
-    _check_unused(config, "kind", "count", "seed")
+    check_unused(config, ("kind", "count", "seed"), _NOT_RECORDED)
     source = Path(config.source).expanduser()
     model = arm if env.limits == "hardware" else build_arm(dataclasses.replace(env.expert, home=None), "hardware")
     imported, notes = import_demonstrations(
@@ -119,11 +117,6 @@ def _print_clearance(console: Console, env: EnvConfig, arm: Arm, demonstrations:
     floor_height = env.world.floor_height if env.world else 0.0
     clearances = smallest_clearances(arm.embodiment, capsules, demonstrations.qpos, floor_height)
     console.print(touching_line(clearances), soft_wrap=True, highlight=False)
-
-
-def _check_unused(config: RecordingConfig, *keys: str) -> None:
-    if unused := [key for key in keys if getattr(config, key) not in (None, [], "")]:
-        raise ValueError(f"{unused[0]}: expected none with source=FILE, whose motions are not recorded")
 
 
 def _files(config: RecordingConfig) -> tuple[Path, Path]:

@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from mimic.arms.arm import ArmConfig, build_arm
+from mimic.base.config import check_unused
 from mimic.commands.capture import fixed_fraction, named_arm, read_arm, trunk_length
 from mimic.commands.config import CaptureConfig, ViewConfig
 from mimic.envs.config import EnvConfig
@@ -59,7 +60,7 @@ def read_clip(config: ViewConfig, env: EnvConfig) -> tuple[Clip, LinkMotion, np.
       ValueError: what `read_arm` rejects, or keys that a view does not use.
     """
     capture = config.capture
-    _check_unused(capture, _OF_WINDOWS, "which cuts no windows")
+    check_unused(capture, _OF_WINDOWS, "with this source of a view, which cuts no windows", "capture.")
     fixed = fixed_fraction(build_arm(env.learner, env.limits, env.metric.links).embodiment)
     read = read_arm(Path(config.source).expanduser(), config.arm or "right", capture, fixed)
     kept = [index for index, part in enumerate(read.parts) if len(part.start) > 2]
@@ -92,7 +93,12 @@ def listen(config: ViewConfig) -> PointListener:
     Raises:
       ValueError: no address, one that other machines can reach though `host` is not that one, or one that is in use.
     """
-    _check_unused(config.capture, (*_OF_CLIPS, *_OF_WINDOWS), "whose points are neither filtered nor slowed down")
+    check_unused(
+        config.capture,
+        (*_OF_CLIPS, *_OF_WINDOWS),
+        "with this source of a view, whose points are neither filtered nor slowed down",
+        "capture.",
+    )
     expected = f"source: expected a file or {SCHEME}localhost:PORT, got {config.source!r:.100}"
     try:
         parts = urlsplit(config.source)
@@ -181,10 +187,3 @@ def _with_model(env: EnvConfig, links: LinkMotion, zero: np.ndarray) -> Iterator
         model = Path(folder) / f"{links.name}.xml"
         model.write_text(ball_chain_xml(links, zero))
         yield dataclasses.replace(env, expert=ArmConfig(model=str(model)))
-
-
-def _check_unused(capture: CaptureConfig, names: tuple[str, ...], reason: str) -> None:
-    default = CaptureConfig()
-    for name in names:
-        if getattr(capture, name) != getattr(default, name):
-            raise ValueError(f"capture.{name}: expected none with this source of a view, {reason}")

@@ -268,8 +268,8 @@ def test_a_missing_package_is_named(reason, recorded, monkeypatch, format, packa
         (["demonstrations={npz}", "out={npz}"], "exists; name a new folder"),
         (["demonstrations=nothing.npz", "out=new"], "no file at 'nothing.npz'"),
         (["demonstrations={npz}", "out=new", "format=hdf5"], "format: expected one of lerobot, rosbag2, got 'hdf5'"),
-        (["demonstrations={npz}", "out=new", "split=train"], "split: expected only with run="),
-        (["run={run}", "out=new", "retargeted={npz}"], "retargeted: expected only with demonstrations="),
+        (["demonstrations={npz}", "out=new", "split=train"], "split: expected none without run="),
+        (["run={run}", "out=new", "retargeted={npz}"], "retargeted: expected none with run="),
         (["run={run}", "out=new", "checkpoint=5"], "checkpoint"),
     ],
 )

@@ -209,7 +209,7 @@ def test_tracking_is_the_same_on_a_virtual_robot_as_in_the_environment(tmp_path)
     ("arguments", "message"),
     [
         (["robot=panda"], "robot: expected one of virtual_panda, virtual_robot, got 'panda'"),
-        (["edges=true"], "robot_world, robot_loop, edges: expected only with robot="),
+        (["edges=true"], "edges: expected none without robot="),
         (["robot=virtual_panda", "robot_loop=mars"], "robot_loop: expected one of mimic, ruckig"),
         (["robot=virtual_panda", "robot_world=mars"], "robot_world: expected one of nominal, hardware"),
         (["robot=virtual_panda", "controller=pd"], "controller: expected policy or tracking with robot=, got pd"),

@@ -120,7 +120,7 @@ def test_a_video_that_lacks_frames_is_removed(tmp_path, monkeypatch, options):
         ({"learner": "planar7dof"}, "demonstrations: expected motions of planar4 .* got planar7"),
         ({"learner": "planar5dof"}, "unknown environment 'planar5dof'"),
         ({"demonstration": 2}, "demonstration: expected an index of the file from 0 to 1, got 2"),
-        ({"run": "runs/NAME"}, "run: has no effect with retargeted=FILE"),
+        ({"run": "runs/NAME"}, "run: expected none with retargeted=FILE"),
     ],
 )
 def test_bad_files_are_rejected_in_one_line(files, changes, message):
