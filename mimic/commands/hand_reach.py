@@ -14,12 +14,13 @@ from rich.table import Table
 from mimic.arms.arm import ArmConfig, ArmPair, build_arm, finite_velocity_limit
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
+from mimic.control.clearance import clearance
+from mimic.metric.capsule_distances import clearance_constants
 from mimic.metric.config import MetricConfig
 from mimic.metric.distance import Metric
 from mimic.metric.kinematics import link_state_table
 from mimic.retargeting.base_placement import POSITION_ALONE, best_bases, repeated
 from mimic.retargeting.certificate import POSITION, ROTATION
-from mimic.retargeting.clearance import make_clearance
 from mimic.retargeting.hand_speeds import speeds_needed
 from mimic.retargeting.hand_target import Placement
 from mimic.retargeting.pose import imitate_pose
@@ -130,7 +131,7 @@ def _capsules(arm: ArmConfig) -> Capsules | None:
 
 
 def _clearances(arm: Embodiment, capsules: Capsules, qpos: np.ndarray) -> Float[np.ndarray, " poses"]:
-    return np.asarray(jax.jit(jax.vmap(make_clearance(arm, capsules, _NO_FLOOR)))(qpos))
+    return clearance(np.asarray(qpos, np.float32), clearance_constants(arm, capsules, _NO_FLOOR))
 
 
 def _reach(

@@ -1,7 +1,7 @@
-"""The clearance of an arm: how far its capsules are from each other and from the floor, without JAX.
+"""The clearance of an arm: how far its capsules are from each other and from the floor, by NumPy.
 
-`xp` is the array library of the arguments, `numpy` on a robot or `jax.numpy`. `mimic.metric.capsule_distances` computes
-the same distances for optimisation, in scalar arithmetic: that is fast on GPUs, but takes milliseconds on a CPU.
+For optimisation `mimic.metric.capsule_distances` moves the capsules by JAX in scalar arithmetic: that is fast on GPUs,
+but takes milliseconds on a CPU.
 """
 
 from typing import Any, NamedTuple
@@ -40,7 +40,7 @@ class ClearanceConstants(NamedTuple):
     floor_height: Array
 
 
-def clearance(qpos: Array, arm: ClearanceConstants, xp: Any) -> Array:
+def clearance(qpos: Array, arm: ClearanceConstants) -> Array:
     """The clearance [...] [m] of an arm in poses [..., joints] [rad], negative where something touches.
 
     It is the minimum distance of the pairs of capsules, and of capsules from the floor.
@@ -48,43 +48,48 @@ def clearance(qpos: Array, arm: ClearanceConstants, xp: Any) -> Array:
     Args:
       qpos: angles.
       arm: the arm.
-      xp: array library.
     """
-    start, end = capsule_axes(qpos, arm, xp)
-    distances = pair_distances(start, end, arm, xp)
-    lowest = xp.minimum(start[..., arm.above, 2], end[..., arm.above, 2])
+    start, end = capsule_axes(qpos, arm)
+    distances = pair_distances(start, end, arm)
+    lowest = np.minimum(start[..., arm.above, 2], end[..., arm.above, 2])
     heights = lowest - (arm.radius[arm.above] + arm.floor_height)
-    nothing = xp.full_like(qpos[..., :1], _FAR)
-    return xp.concatenate([distances, heights, nothing], axis=-1).min(axis=-1)
+    nothing = np.full_like(qpos[..., :1], _FAR)
+    return np.concatenate([distances, heights, nothing], axis=-1).min(axis=-1)
 
 
-def pair_distances(start: Array, end: Array, arm: ClearanceConstants, xp: Any) -> Array:
+def pair_distances(start: Array, end: Array, arm: ClearanceConstants) -> Array:
     """Distances [..., pairs] of the pairs of capsules [m], negative where they intersect; see `capsule_axes`."""
     i, j = arm.pairs[:, 0], arm.pairs[:, 1]
     axes = start[..., i, :], end[..., i, :], start[..., j, :], end[..., j, :]
-    return _segment_distances(*axes, xp) - (arm.radius[i] + arm.radius[j])
+    return segment_distances(*axes, np) - (arm.radius[i] + arm.radius[j])
 
 
-def capsule_axes(qpos: Array, arm: ClearanceConstants, xp: Any) -> tuple[Array, Array]:
+def capsule_axes(qpos: Array, arm: ClearanceConstants) -> tuple[Array, Array]:
     """Ends [..., capsules, 3] of the capsules' axes in poses [m]; see `clearance`."""
     batch, identity = qpos.shape[:-1], np.eye(3, dtype=arm.axis.dtype)
-    rotations = [xp.broadcast_to(identity, (*batch, 3, 3))]  # of the bodies from the zero pose, the base first
-    shifts = [xp.broadcast_to(0 * identity[0], (*batch, 3))]
+    rotations = [np.broadcast_to(identity, (*batch, 3, 3))]  # of the bodies from the zero pose, the base first
+    shifts = [np.broadcast_to(0 * identity[0], (*batch, 3))]
     angle, cross = qpos[..., None, None], np.cross(identity, arm.axis[:, None])  # cross @ x: product of axis and x
-    turns = identity + xp.sin(angle) * cross + (1 - xp.cos(angle)) * (cross @ cross)
+    turns = identity + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
     steps = arm.anchor[..., None] - turns @ arm.anchor[..., None]
     for joint, parent in enumerate(np.asarray(arm.parent).tolist()):
         rotation = rotations[parent + 1]
         shifts.append(shifts[parent + 1] + (rotation @ steps[..., joint, :, :])[..., 0])
         rotations.append(rotation @ turns[..., joint, :, :])
     body = arm.joint + 1
-    rotation, shift = xp.stack(rotations, axis=-3)[..., body, :, :], xp.stack(shifts, axis=-2)[..., body, :]
-    start, end = (xp.einsum("...cij,cj->...ci", rotation, points) + shift for points in (arm.start, arm.end))
+    rotation, shift = np.stack(rotations, axis=-3)[..., body, :, :], np.stack(shifts, axis=-2)[..., body, :]
+    start, end = (np.einsum("...cij,cj->...ci", rotation, points) + shift for points in (arm.start, arm.end))
     return start, end
 
 
-def _segment_distances(a: Array, b: Array, c: Array, d: Array, xp: Any) -> Array:
-    """Distances [...] of the segments a-b and c-d, as `mimic.metric.capsule_distances.segment_distance`."""
+def segment_distances(a: Array, b: Array, c: Array, d: Array, xp: Any, smoothing: float = 0.0) -> Array:
+    """Distances [...] of the line segments a-b and c-d (Ericson 2005, section 5.1.9).
+
+    Args:
+      a, b, c, d: [..., 3] ends [m].
+      xp: array library, `numpy` or `jax.numpy`.
+      smoothing: the distance of segments that cross [m], where its gradient is then 0.
+    """
     u, v, w = b - a, d - c, a - c
     uu, vv, uv, uw, vw = (_dot(x, y) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
     determinant = uu * vv - uv * uv
@@ -95,7 +100,7 @@ def _segment_distances(a: Array, b: Array, c: Array, d: Array, xp: Any) -> Array
     s = xp.clip((uv * t - uw) / xp.maximum(uu, _TINY), 0, 1)
     t = xp.clip((uv * s + vw) / xp.maximum(vv, _TINY), 0, 1)
     difference = w + s[..., None] * u - t[..., None] * v
-    return xp.sqrt(_dot(difference, difference))
+    return xp.sqrt(_dot(difference, difference) + smoothing**2)
 
 
 def _dot(x: Array, y: Array) -> Array:

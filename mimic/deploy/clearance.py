@@ -15,4 +15,4 @@ class Clearance:
     def __call__(self, qpos: np.ndarray) -> np.ndarray:
         """The clearances [rows]."""
         with np.errstate(invalid="ignore"):
-            return clearance(np.ascontiguousarray(qpos, np.float32), self._constants, np)
+            return clearance(np.ascontiguousarray(qpos, np.float32), self._constants)

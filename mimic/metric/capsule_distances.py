@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -16,7 +15,6 @@ from mimic.metric.kinematics import joint_frames
 
 _SMOOTHING = 1e-4  # m, of the distance of crossing segments, whose second derivative is infinite without
 _RANDOM_POSES, _CHANGE = 1000, 1e-3  # m, of a distance that joints change
-_SHORT = 1e-6  # m, axis of a capsule that is a sphere
 
 
 def capsule_axes(arm: Embodiment, capsules: Capsules, qpos: Float[Array, " joints"]) -> tuple[Array, Array]:
@@ -35,18 +33,18 @@ def capsule_axes(arm: Embodiment, capsules: Capsules, qpos: Float[Array, " joint
 
 
 def pair_distances(capsules: Capsules, start: Array, end: Array) -> Float[Array, " pairs"]:
-    """Distance of each of the capsules' pairs [m], negative where they intersect."""
+    """Distance of each of the capsules' pairs [m], negative where they intersect; smoothed where axes cross."""
     i, j = np.array(capsules.pairs).T
     radii = jnp.asarray(capsules.radius[i] + capsules.radius[j], start.dtype)
-    return jax.vmap(segment_distance)(start[i], end[i], start[j], end[j]) - radii
+    return clearance.segment_distances(start[i], end[i], start[j], end[j], jnp, _SMOOTHING) - radii
 
 
 def changing_pairs(arm: Embodiment, capsules: Capsules) -> Bool[np.ndarray, " pairs"]:
     """Whether the joints change the distance of each pair; two capsules of a Panda's wrist are always 2.0 cm apart."""
     qpos = np.random.default_rng(0).uniform(-np.pi, np.pi, (_RANDOM_POSES, arm.num_joints))
     constants = clearance_constants(arm, capsules, pairs=capsules.pairs)
-    axes = clearance.capsule_axes(qpos, constants, np)  # by NumPy, which has nothing to compile
-    return np.ptp(clearance.pair_distances(*axes, constants, np), axis=0) > _CHANGE
+    axes = clearance.capsule_axes(qpos, constants)  # by NumPy, which has nothing to compile
+    return np.ptp(clearance.pair_distances(*axes, constants), axis=0) > _CHANGE
 
 
 def colliding_pairs(arm: Embodiment, capsules: Capsules) -> list[tuple[int, int]]:
@@ -87,28 +85,6 @@ def clearance_constants(
         above=np.flatnonzero(~np.array(capsules.near_base)),
         floor_height=floor,
     )
-
-
-def segment_distance(
-    a: Float[Array, "3"], b: Float[Array, "3"], c: Float[Array, "3"], d: Float[Array, "3"]
-) -> Float[Array, ""]:
-    """Distance of the line segments a-b and c-d (Ericson 2005, section 5.1.9).
-
-    Smoothed where they cross, where it is 0.1 mm and its gradient 0.
-    """
-    u, v, w = b - a, d - c, a - c
-    tiny = _SHORT**2
-    uu, vv, uv, uw, vw = (jnp.sum(x * y) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
-    scale = uu * vv
-    determinant = scale - uv * uv
-    is_parallel = determinant <= 1e-6 * scale  # float32 resolves no smaller angle
-    s = jnp.where(is_parallel, 0.5, (uv * vw - vv * uw) / jnp.where(is_parallel, 1, determinant))
-    s = jnp.clip(s, 0, 1)
-    t = jnp.clip((uv * s + vw) / jnp.maximum(vv, tiny), 0, 1)
-    s = jnp.clip((uv * t - uw) / jnp.maximum(uu, tiny), 0, 1)
-    t = jnp.clip((uv * s + vw) / jnp.maximum(vv, tiny), 0, 1)
-    difference = w + s * u - t * v
-    return jnp.sqrt(jnp.sum(difference * difference) + _SMOOTHING**2)
 
 
 def intrusion(distance: Float[Array, " pairs"], clearance: float) -> Float[Array, ""]:

@@ -189,7 +189,7 @@ def hand_points(arm: Embodiment, qpos: Float[np.ndarray, "*rows joints"]) -> tup
         np.array(arm.joint_parent), np.asarray(arm.joint_axis, float), np.asarray(arm.joint_anchor, float),
         np.repeat(arm.hand_joint[0], 3), start, end, np.zeros(3), nothing, nothing[:, 0], 0.0,
     )  # fmt: skip
-    starts, ends = capsule_axes(qpos, points, np)
+    starts, ends = capsule_axes(qpos, points)
     return starts[..., 0, :], np.swapaxes(ends - starts, -1, -2)
 
 

@@ -108,7 +108,7 @@ def certify(
     steps = np.concatenate([steps, np.zeros((1, qpos.shape[1]))])  # after the last frame the arm stands
     clearance = np.full(len(qpos), np.nan)
     if capsules is not None:
-        clearance = control_clearance.clearance(qpos, clearance_constants(learner, capsules, _NO_FLOOR), np)
+        clearance = control_clearance.clearance(qpos, clearance_constants(learner, capsules, _NO_FLOOR))
     touches = clearance < _TOUCHING
     if contacts is not None:
         touches = clearance < 0

@@ -3,8 +3,6 @@
 import copy
 from collections.abc import Callable
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,7 +11,8 @@ from mimic.arms.arm import ArmConfig, arm_spec, build_arm
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.mujoco_chain import data_at_zero
-from mimic.retargeting.clearance import make_clearance
+from mimic.control.clearance import clearance
+from mimic.metric.capsule_distances import clearance_constants
 
 
 def smallest_clearances(
@@ -28,8 +27,8 @@ def smallest_clearances(
       qpos: joint angles [rad].
       floor_height: see `WorldConfig`.
     """
-    clearance = jax.jit(jax.vmap(make_clearance(arm, capsules, floor_height)))
-    return np.stack([np.asarray(clearance(jnp.asarray(motion, jnp.float32))).min() for motion in qpos])
+    constants = clearance_constants(arm, capsules, floor_height)
+    return np.stack([clearance(np.asarray(motion, np.float32), constants).min() for motion in qpos])
 
 
 def make_contacts(

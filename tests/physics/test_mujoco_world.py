@@ -2,16 +2,16 @@
 
 import copy
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
+from mimic.control.clearance import clearance
+from mimic.metric.capsule_distances import clearance_constants
 from mimic.physics.mujoco_world import disabled, loaded_fields, mujoco_world
 from mimic.physics.world import WorldConfig
-from mimic.retargeting.clearance import make_clearance
 from tests.helpers.array_cases import acceleration
 from tests.physics.test_inner_loop import NAMES, draw_for, make_arm_and_plant, mujoco_model
 
@@ -60,7 +60,7 @@ def test_gravity_is_vertical_and_the_floor_is_that_of_the_base(tmp_path, floor_h
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
     assert not capsules.pairs  # each contact is one with the floor
-    expected = make_clearance(arm.embodiment, capsules, floor_height)(jnp.asarray(qpos, jnp.float32))
+    expected = clearance(qpos, clearance_constants(arm.embodiment, capsules, floor_height))
     assert min(data.contact.dist) == pytest.approx(float(expected), abs=2e-4)
 
 

@@ -1,4 +1,4 @@
-"""The clearance by matrices: the distances of the retargeting costs and of C MuJoCo, by JAX and by NumPy."""
+"""The clearance by NumPy: the distances of the retargeting costs, by JAX, and of C MuJoCo."""
 
 import dataclasses
 
@@ -10,9 +10,8 @@ import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
-from mimic.control.clearance import clearance as control_clearance
+from mimic.control.clearance import clearance
 from mimic.metric.capsule_distances import capsule_axes, changing_pairs, clearance_constants, pair_distances
-from mimic.retargeting.clearance import make_clearance
 from tests.helpers.virtual_robots import model
 
 CONFIGS = {"panda": ArmConfig(), "locked": ArmConfig(locked=[3, 6, 7]), "two arms": ArmConfig(model="panda_pair")}
@@ -35,13 +34,10 @@ def test_it_is_the_distance_of_the_costs(config):
         return jnp.minimum(pair_distances(capsules, start, end)[np.flatnonzero(is_changing)].min(), height.min())
 
     qpos = poses(arm)
-    clearance = jax.jit(jax.vmap(make_clearance(arm, capsules)))(qpos)
-    assert np.ptp(clearance) > 0.1
+    actual = clearance(qpos, clearance_constants(arm, capsules))
+    assert np.ptp(actual) > 0.1 and actual.dtype == np.float32
     # The costs smooth distances by 0.1 mm where axes cross; there is none otherwise.
-    np.testing.assert_allclose(clearance, jax.vmap(expected)(qpos), atol=2e-4)
-    by_numpy = control_clearance(qpos, clearance_constants(arm, capsules), np)
-    assert by_numpy.dtype == np.float32
-    np.testing.assert_allclose(by_numpy, clearance, atol=1e-5)  # float32
+    np.testing.assert_allclose(actual, jax.jit(jax.vmap(expected))(qpos), atol=2e-4)
 
 
 def test_it_is_that_of_mujocos_geoms():
@@ -49,8 +45,7 @@ def test_it_is_that_of_mujocos_geoms():
     robot = model().simulated.model
     data = mujoco.MjData(robot)
     arm = build_arm(ArmConfig(), "hardware").embodiment
-    clearance = jax.jit(jax.vmap(make_clearance(arm, fit_capsules(ArmConfig(), "hardware"))))
-    rows = poses(arm, 100, seed=1)
+    constants, rows = clearance_constants(arm, fit_capsules(ArmConfig(), "hardware")), poses(arm, 100, seed=1)
     expected = []
     for qpos in rows:
         data.qpos[:] = qpos
@@ -58,7 +53,7 @@ def test_it_is_that_of_mujocos_geoms():
         pairs = zip(robot.pair_geom1, robot.pair_geom2, strict=True)
         expected.append(min(mujoco.mj_geomDistance(robot, data, i, j, 10.0, None) for i, j in pairs))
     # Intersecting capsules: MuJoCo and we may differ by how deep; only the sign counts.
-    expected, value = np.array(expected), np.asarray(clearance(rows))
+    expected, value = np.array(expected), clearance(rows, constants)
     apart = expected > 1e-3
     assert 10 < apart.sum() < 95
     np.testing.assert_allclose(value[apart], expected[apart], atol=1e-5)
@@ -69,12 +64,12 @@ def test_an_arm_without_pairs_has_the_clearance_of_the_floor():
     config = ArmConfig(locked=[1, 3, 4, 5, 6, 7])  # one body that moves, and the base
     arm, capsules = build_arm(config, "hardware").embodiment, fit_capsules(config, "hardware")
     no_pairs = dataclasses.replace(capsules, joint=(0,) * len(capsules.joint))
-    assert no_pairs.pairs == () and float(make_clearance(arm, no_pairs)(jnp.zeros(1))) > 0
+    assert no_pairs.pairs == () and clearance(np.zeros(1), clearance_constants(arm, no_pairs)) > 0
 
 
 def test_the_floor_may_be_lower():
     config = ArmConfig(locked=[1, 3, 4, 6, 7])
     arm, capsules = build_arm(config, "hardware").embodiment, fit_capsules(config, "hardware")
     capsules = dataclasses.replace(capsules, joint=(1,) * len(capsules.joint))  # on one body, so without pairs
-    low, high = (float(make_clearance(arm, capsules, height)(jnp.zeros(2))) for height in (-0.1, 0.0))
+    low, high = (clearance(np.zeros(2), clearance_constants(arm, capsules, height)) for height in (-0.1, 0.0))
     assert low == pytest.approx(high + 0.1, abs=1e-6)

@@ -12,7 +12,8 @@ import pytest
 from mimic.arms.arm import ArmConfig, arm_spec
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import panda, planar_arm
-from mimic.metric.capsule_distances import capsule_axes, pair_distances, segment_distance
+from mimic.control.clearance import segment_distances
+from mimic.metric.capsule_distances import capsule_axes, pair_distances
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.costs import (
     Costs,
@@ -39,7 +40,7 @@ def test_segment_distances_equal_those_of_mujoco(x64):
         '<body mocap="true"><geom type="capsule" size="0.02 0.1"/></body></worldbody></mujoco>'
     )
     data, rng, compared = mujoco.MjData(model), np.random.default_rng(0), 0
-    distance = jax.jit(segment_distance)
+    distance = jax.jit(lambda *ends: segment_distances(*ends, jnp, smoothing=1e-4))
     for trial in range(300):
         data.mocap_pos[:] = rng.normal(size=(2, 3)) * 0.4
         data.mocap_quat[:] = rng.normal(size=(2, 4))
