@@ -3,9 +3,9 @@
     python -m benchmarks.study --runs DIR --out FILE [--preset paper] [--only GROUP ...] [--jobs N]
 
 Trains each case by `python -m mimic.train -m` over its seeds, and evaluates runs by `python -m mimic.evaluate`, several
-in parallel. Then `benchmarks.motions` and `benchmarks.unknown` measure the groups "policies" and "unknown", each into a
-results file next to FILE. What DIR contains is not repeated, so that an interrupted study can be continued. Prints the
-table of `python -m mimic.collect DIR`, writes a results file, and figures next to it.
+in parallel. Then other benchmarks measure the runs of some groups, each into a results file next to FILE. What DIR
+contains is not repeated, so that an interrupted study can be continued. Prints the table of
+`python -m mimic.collect DIR`, writes a results file, and figures next to it.
 """
 
 import csv
@@ -26,6 +26,7 @@ from benchmarks.common.processes import run_parallel
 from benchmarks.common.record import WIDTH, Row, write_results
 from benchmarks.figures import study_figures
 from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.named_arms import named_arms
 from mimic.base.overrides import setting
 from mimic.commands.collect.collect import prepare_collection
 from mimic.commands.collect.finished_runs import find_runs
@@ -71,6 +72,10 @@ def _values(name: str) -> list[dict[str, str]]:
     """The values of the placeholder in a name."""
     if "{arm}" in name:
         return [{"arm": arm} for arm in STUDY["arms"]]
+    if "{real}" in name:
+        return [
+            {"real": arm, "others": ",".join(other for other in STUDY["real"] if other != arm)} for arm in STUDY["real"]
+        ]
     locks = [lock for count in (1, 2) for lock in itertools.combinations("1234567", count)]
     return [{"joints": "-".join(lock), "list": ",".join(lock)} for lock in locks] if "{joints}" in name else [{}]
 
@@ -79,12 +84,13 @@ def evaluations(chosen: Sequence[Case], folder: Path, unseen: dict[str, str]) ->
     """Commands that evaluate policies on other demonstrations and arms, and other controllers, by their new folders."""
     seeds, commands = {case.name: case.seeds for case in chosen}, {}
     for pattern, kinds in STUDY["evaluations"].items():
-        for name in (pattern.format(**values) for values in _values(pattern)):
+        for values in _values(pattern):
+            name = pattern.format(**values)
             for kind, arguments in kinds.items():
                 for seed in range(seeds.get(name, 0) if kind == "unseen" else min(seeds.get(name, 0), 1)):
                     run, out = folder / name / str(seed), folder / f"{name}--{kind}" / str(seed)
                     paths = setting("run", str(run)), setting("out", str(out))
-                    overrides = [unseen.get(argument, argument) for argument in arguments.split()]
+                    overrides = [unseen.get(argument) or argument.format(**values) for argument in arguments.split()]
                     commands[out] = [sys.executable, "-m", "mimic.evaluate", *paths, *overrides]
     return commands
 
@@ -119,13 +125,13 @@ def run(chosen: Sequence[Case], folder: Path, jobs: int) -> list[Path]:
 def measurements(chosen: Sequence[Case], folder: Path, out: Path, count: int) -> dict[Path, list[str]]:
     """Commands that measure all runs of a group, by their new results files next to that of the study."""
     commands = {}
-    for name, (group, arguments) in STUDY["measurements"].items():
+    for name, (benchmark, group, arguments) in STUDY["measurements"].items():
         cases_of_group = [case for case in chosen if case.group == group]
         runs = [str(folder / case.name / str(seed)) for case in cases_of_group for seed in range(case.seeds)]
         results = out.with_name(f"{name}_{out.stem.rpartition('_')[2]}.json")
         if runs and all(case.done(folder) for case in cases_of_group) and not results.is_file():
             options = *arguments.split(), "--count", str(count), "--out", str(results), "--runs", *runs
-            commands[results] = [sys.executable, "-m", f"benchmarks.{name}", *options]
+            commands[results] = [sys.executable, "-m", f"benchmarks.{benchmark}", *options]
     return commands
 
 
@@ -156,6 +162,9 @@ def main() -> None:
     parser.add_argument("--preset", choices=STUDY["presets"], default="paper")
     options = parser.parse_args()
     chosen = [case for case in cases(options.preset) if case.group in options.only]
+    if missing := sorted(set(STUDY["real"]) - set(named_arms())):
+        chosen = [case for case in chosen if case.group != "unseen_arms"]
+        print(f"unseen_arms: left out, because this machine has no {', '.join(missing)}, see docs/own_arm.md")
     options.runs.mkdir(parents=True, exist_ok=True)
     failed = [] if options.collect else run(chosen, options.runs, options.jobs)
     if options.out and not options.collect:

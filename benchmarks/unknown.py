@@ -4,17 +4,20 @@
 
 RUN is a run directory of `python -m mimic.train env=panda7dof world=unknown`; runs that differ in nothing but their
 seed are one policy, named by `--names`. Each set of episodes has one of the world's ranges at full width and the others
-as the data sheet says; "all" has all of them. The motions are the test set's, `--count` of each kind.
+as the data sheet says; "all" has all of them. The motions are the test set's, `--count` of each kind. Runs of
+`env.world.expert=links` or `points` are measured with a noisy or partly hidden expert too.
 
 The controllers are computed torque along the poses of the kinematic bound, which know the motion in advance. They
 predict the state at which their torque will act, from the same measurements and actions that the policy observes, by a
 model: that of the data sheet with a delay of one tick ("nominal"), the same with a correction by the mean difference
 between the torques that were commanded and those that explain the measured motion of the last ticks ("observer"), or
-the arm as it is drawn, with its delay ("true"). Each has the best of several frequencies on the training
-demonstrations.
+the arm as it is drawn, with its delay ("true"). Where the expert is measured they know the measurements of the whole
+motion in advance, and follow the expert's angles that explain them, see `estimated_angles`. Each has the best of
+several frequencies on the training demonstrations.
 """
 
 import argparse
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
@@ -37,6 +40,7 @@ from mimic.envs.world_state import HardwareState
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.rollout_metrics import gap_interval
 from mimic.evaluation.tracking_controllers import best_setting, reference_motions
+from mimic.metric.kinematics import LinkStates, link_states
 from mimic.motions.demonstrations import Demonstrations
 from mimic.physics import dynamics
 from mimic.physics.inner_loop import LoopState
@@ -51,6 +55,8 @@ from mimic.trainers.ppo.trainer import PPOTrainer
 
 Array = Any
 FREQUENCIES = (2.0, 4.0, 6.0, 8.0)  # candidates [rad/s]
+PRIOR, GAUSS_NEWTON_STEPS = 1e-3, 5  # weight of the tick before [1/rad^2]; angles change little in a tick
+SMOOTHING = 3.0  # ticks, width of the local parabolas
 COLUMNS = "env set controller gap:.2% low:.2% high:.2% seeds demonstrations frequency"
 DATA_SHEET = WorldConfig(gravity=True, friction=[1.0, 1.0], action_delay=[1, 1], stops=True)
 RANGES = {
@@ -60,13 +66,17 @@ RANGES = {
     "compensation": ("gravity_error",),
     "friction": ("friction",),
     "delay": ("action_delay",),
+    "noisy expert": ("expert_noise",),
+    "hidden expert": ("expert_loss", "hidden_links"),
 }
 
 
 def worlds(trained: WorldConfig) -> Iterator[tuple[str, WorldConfig]]:
-    """The world of each set: ranges of the training's world, the others as in the data sheet."""
+    """The world of each set: ranges of the training's world, the others as in the data sheet; without known ones."""
     unknown = {name for names in RANGES.values() for name in names}
     for set_name, ranges in RANGES.items():
+        if ranges and all(getattr(trained, name) == getattr(DATA_SHEET, name) for name in ranges):
+            continue
         known = {name: getattr(DATA_SHEET, name) for name in unknown.difference(ranges)}
         yield set_name, dataclasses.replace(trained, **known)
     yield "all", trained
@@ -111,9 +121,61 @@ def missing_torque(env: HardwareEnv, draw: Draw, episode: HardwareState) -> Arra
     return (commanded - needed).mean(axis=0)
 
 
+def estimated_angles(env: HardwareEnv) -> Array:
+    """Angles [demonstrations, ticks, joints] of the expert that explain what the episodes of an evaluation measure.
+
+    Least squares of the visible positions and directions at each tick, near the angles of the tick before; then local
+    parabolas over time, in which a tick counts as much as it has visible links.
+    """
+    ticks = env.config.horizon + 1
+
+    def of_tick(before: Array, measured: tuple[LinkStates, Array]) -> tuple[Array, Array]:
+        states, visible = measured
+
+        def residual(qpos: Array) -> Array:
+            now = link_states(env.expert, qpos, jnp.zeros_like(qpos))
+            terms = [now.position - states.position]
+            if states.direction is not None and now.direction is not None:
+                terms.append(now.direction - states.direction)
+            return jnp.concatenate([(visible[:, None] * term).ravel() for term in terms])
+
+        def improve(qpos: Array, _: None) -> tuple[Array, None]:
+            slope, prior = jax.jacfwd(residual)(qpos), PRIOR * jnp.eye(len(qpos))
+            gradient = slope.T @ residual(qpos) + PRIOR * (qpos - before)
+            return qpos - jnp.linalg.solve(slope.T @ slope + prior, gradient), None
+
+        qpos, _ = jax.lax.scan(improve, before, None, length=GAUSS_NEWTON_STEPS)
+        return qpos, qpos
+
+    def of_motion(demonstration: Array) -> Array:
+        start = env.start(jax.random.fold_in(jax.random.PRNGKey(0), demonstration), demonstration)
+        seen = env.seen_expert(start, 0, ticks)
+        home = jnp.asarray(env.expert.home, jnp.float32)
+        return smoothed(jax.lax.scan(of_tick, home, (seen.states, seen.visible))[1], seen.visible.sum(axis=1))
+
+    return jax.jit(jax.vmap(of_motion))(jnp.arange(env.demonstrations.count))
+
+
+def smoothed(values: Array, weights: Array) -> Array:
+    """Values [ticks, numbers] of parabolas that are fitted around each tick."""
+    time = jnp.arange(len(values), dtype=jnp.float32)
+
+    def at(tick: Array) -> Array:
+        powers = (time - tick)[:, None] ** jnp.arange(3)
+        near = weights * jnp.exp(-(((time - tick) / SMOOTHING) ** 2) / 2)
+        square = powers.T @ (near[:, None] * powers) + 1e-6 * jnp.eye(3)
+        return jnp.linalg.solve(square, powers.T @ (near[:, None] * values))[0]
+
+    return jax.vmap(at)(time)
+
+
 def controllers(env: HardwareEnv) -> dict[str, Callable[[Array], Callable[[State], Array]]]:
     """Functions from a frequency to each controller."""
-    qpos, qvel = (jnp.asarray(x, jnp.float32) for x in reference_motions(env))
+    known = env
+    if env.world.expert != "exact":
+        known = copy.copy(env)
+        known.demonstrations = dataclasses.replace(env.demonstrations, qpos=np.asarray(estimated_angles(env), float))
+    qpos, qvel = (jnp.asarray(x, jnp.float32) for x in reference_motions(known))
     nominal, dt = data_sheet(env), env.config.control_dt
 
     def make(name: str, frequency: Array) -> Callable[[State], Array]:
@@ -157,8 +219,9 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def _trainer(run: Path, config: TrainConfig, world: WorldConfig, unseen: Demonstrations) -> PPOTrainer:
-    """The trainer of a run in another world, with the run's own history."""
-    own = dataclasses.replace(world, history=cast(WorldConfig, config.env.world).history)
+    """The trainer of a run in another world, with what the run's policy observes."""
+    trained = cast(WorldConfig, config.env.world)
+    own = dataclasses.replace(world, history=trained.history, expert=trained.expert)
     changed = dataclasses.replace(config, env=dataclasses.replace(config.env, world=own))
     return make_ppo_trainer(changed, run, unseen, None)
 

@@ -119,6 +119,8 @@ def hardware_tracking(results: Results) -> list[Cells]:
 UNKNOWN = {
     "history": "policy with history",
     "present": "without",
+    "links": "policy that sees links",
+    "points": "points alone",
     "nominal": "computed torque, data sheet",
     "observer": "corrected",
     "true": "computed torque, true model",
@@ -127,9 +129,11 @@ UNKNOWN_SETS = {"none": "nothing", "compensation": "gravity compensation", "all"
 
 
 def unknown(results: Results) -> list[Cells]:
-    rows: list[Cells] = [("unknown, gap [%]", *UNKNOWN.values())]
+    measured = {row["controller"] for row in results["rows"]}
+    columns = {key: label for key, label in UNKNOWN.items() if key in measured}
+    rows: list[Cells] = [("unknown, gap [%]", *columns.values())]
     for name in dict.fromkeys(row["set"] for row in results["rows"]):
-        of_set = [one(results["rows"], set=name, controller=controller) for controller in UNKNOWN]
+        of_set = [one(results["rows"], set=name, controller=controller) for controller in columns]
         rows.append((UNKNOWN_SETS.get(str(name), str(name)), *(f"{100 * row['gap']:.2f}" for row in of_set)))
     return rows
 

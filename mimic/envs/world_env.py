@@ -15,6 +15,7 @@ from mimic.control.joint_control import PERIOD, JointParameters, Reference
 from mimic.envs.arm_state import ArmState
 from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import ImitationEnv, observed_parts
+from mimic.envs.seen_expert import SeenExpert, see
 from mimic.envs.world_state import HardwareState
 from mimic.metric.capsule_distances import colliding_pairs
 from mimic.metric.kinematics import LinkStates, link_states
@@ -27,7 +28,7 @@ from mimic.physics.step import PhysicsChoice
 from mimic.physics.world import MAX_DELAY, WorldConfig
 
 SENT_ACTIONS = 3  # that the policy observes: from them it tells how long its actions take
-_DRAW, _START, _MEASURE, _LOSS = 5, 6, 7, 8  # folded into an episode's key, see mimic/envs/imitation.py
+_DRAW, _START, _MEASURE, _LOSS, _EXPERT = 5, 6, 7, 8, 9  # folded into an episode's key, see mimic/envs/imitation.py
 
 
 class HardwareEnv(ImitationEnv):
@@ -35,7 +36,8 @@ class HardwareEnv(ImitationEnv):
 
     Reward and metrics are those of the true motion. The observation has the measured link states of the learner in
     place of the true ones, and then the angles and velocities of the reference, or the measured ones where actions are
-    torques, and the last actions that were sent. With `world.history`, the measured motion of past ticks follows.
+    torques, and the last actions that were sent. With `world.history`, the measured motion of past ticks follows. With
+    `world.expert` the expert's link states are measured ones too, see `see`.
 
     Args:
       config: see `EnvConfig`; of the kind "inner_loop".
@@ -53,6 +55,11 @@ class HardwareEnv(ImitationEnv):
     def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None):
         _check(config)
         super().__init__(config, demonstrations)
+        if self.world.hidden_links[1] >= self.expert.num_links:
+            raise ValueError(
+                f"world.hidden_links: expected fewer than the expert's {self.expert.num_links} links, got "
+                f"{self.world.hidden_links}"
+            )
 
     @property
     def world(self) -> WorldConfig:
@@ -172,10 +179,13 @@ class HardwareEnv(ImitationEnv):
         return jnp.concatenate([qpos, qvel, *((qpos, qvel) if is_torque else (reference.qpos, reference.qvel))])
 
     def privileged(self, state: ArmState) -> Float[Array, " numbers"]:
-        """What only a critic observes: the elapsed fraction of the episode, and what was drawn for it."""
+        """What only a critic observes: the elapsed time, what was drawn, and the true expert where it is measured."""
         draw = cast(HardwareState, state).draw
         fractions = drawn_fractions(draw, self.world, self.config.randomization)
-        return jnp.concatenate([super().privileged(state), fractions])
+        parts = [super().privileged(state), fractions]
+        if self.world.expert != "exact":
+            parts.append(expert_vector([self.expert_at(state.demonstration, state.step + 1)]))
+        return jnp.concatenate(parts)
 
     def commanded_torque(
         self, before: ArmState, after: ArmState, action: Float[Array, " numbers"]
@@ -188,6 +198,12 @@ class HardwareEnv(ImitationEnv):
         """See `ImitationEnv`; after the horizon the expert stays where it is, as in an exported controller."""
         return super().expert_at(demonstration, jnp.minimum(step, self.config.horizon))
 
+    def seen_expert(self, state: ArmState, step: Array | int, ticks: int) -> SeenExpert:
+        """The measured expert of an episode in some ticks from a step on, as the policy observes it."""
+        steps = jnp.arange(ticks) + step
+        states = jax.vmap(self.expert_at, (None, 0))(state.demonstration, steps)
+        return see(self.world, states, jax.random.fold_in(state.key, _EXPERT), steps[0], self.config.control_dt)
+
     def command(self, before: ArmState, action: Float[Array, " numbers"]) -> Float[Array, " joints"]:
         """The target angles [rad], velocities [rad/s] or torques [N m] of an action that arrives at once."""
         reference = cast(HardwareState, before).reference
@@ -197,8 +213,12 @@ class HardwareEnv(ImitationEnv):
         """See the class, and `control_observation`."""
         state = cast(HardwareState, state)
         measured = state.measured[state.draw.observation_delay]
-        expert = [self.expert_at(state.demonstration, state.step + k) for k in range(self.config.preview + 1)]
-        observation = control_observation(self, measured, state.sent.ravel(), expert_vector(expert))
+        if self.world.expert == "exact":
+            ahead = range(self.config.preview + 1)
+            expert = expert_vector([self.expert_at(state.demonstration, state.step + k) for k in ahead])
+        else:
+            expert = self.seen_expert(state, state.step, self.config.preview + 1).vector()
+        observation = control_observation(self, measured, state.sent.ravel(), expert)
         if not self.world.history:
             return observation
         past = jax.lax.dynamic_slice_in_dim(state.measured, state.draw.observation_delay + 1, self.world.history)

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+from mimic.base.config import check_choice
 from mimic.base.ranges import check_ranges, number
 
 PHYSICS = ("mjx", "fused")
@@ -61,6 +62,12 @@ class WorldConfig:
         of `mimic.deploy` takes 0.02 s to check a target; there the time is always that one.
       packet_loss: probability that an action does not arrive; the one before is then used again.
       start_noise: maximum deviation of each joint from the start pose [rad].
+      expert: what the policy observes of the expert: "exact", its link states; "links", measured ones; or "points",
+        measured positions and velocities of the link frames alone. The reward always compares the true states.
+      expert_noise: range of the standard deviation of each measured position [chain lengths] and direction; velocities
+        are differences of two measurements. Only where the expert is measured, as the next two.
+      expert_loss: probability that a tick of the expert is missing.
+      hidden_links: range of the number of the expert's links that are hidden, others in each episode.
       history: number of past ticks whose measured motion and actions the policy observes beside the present, so that it
         can tell what was drawn.
       stops: whether joints have mechanical stops at the ends of their ranges.
@@ -83,6 +90,10 @@ class WorldConfig:
     action_latency: float = number(0.0, at_least=0.0, at_most=1.0)
     packet_loss: float = number(0.0, at_least=0.0, below=1.0)
     start_noise: float = number(0.0, at_least=0.0, at_most=1.0)
+    expert: str = "exact"
+    expert_noise: list[float] = _interval(0.0, 0.0, at_least=0.0, at_most=1.0)
+    expert_loss: float = number(0.0, at_least=0.0, below=1.0)
+    hidden_links: list[int] = number(lambda: [0, 0], at_least=0, at_most=100, entries=(2, 2))
     history: int = number(0, at_least=0, at_most=100)
     stops: bool = False
     contacts: bool = False
@@ -90,9 +101,14 @@ class WorldConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self, "world.")
+        check_choice("world.expert", self.expert, ("exact", "links", "points"))
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, list) and value[0] > value[1]:
                 raise ValueError(f"world.{field.name}: expected [minimum, maximum], got {value}")
         if (any(self.gravity_error) or self.contacts) and not self.gravity:
             raise ValueError("world: expected gravity=true with gravity_error or contacts, got gravity=false")
+        if self.expert == "exact" and (any(self.expert_noise) or self.expert_loss or any(self.hidden_links)):
+            raise ValueError(
+                "world.expert: expected links or points with expert_noise, expert_loss or hidden_links, got exact"
+            )

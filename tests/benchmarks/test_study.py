@@ -30,7 +30,7 @@ def test_every_run_and_evaluation_has_arguments_that_the_commands_take(preset, c
         config = compose("train", case.arguments)
         assert config.env.physics == ("mjx" if case.group == "mjx" else "auto")
     evaluated = study.evaluations(cases, tmp_path, UNSEEN)
-    assert len(evaluated) == (42 if preset == "paper" else 38)
+    assert len(evaluated) == (58 if preset == "paper" else 54)
     kinds = {out.parent.name.partition("--")[2]: out for out in evaluated}
     for out in evaluated if preset == "paper" else kinds.values():
         config = compose("evaluate", evaluated[out][3:])
@@ -57,6 +57,19 @@ def test_the_sweep_locks_every_joint_and_every_pair():
     locked = {case.name: case.arguments for case in study.cases("paper") if case.group == "locked"}
     assert len(locked) == 7 + 21 and {"locked-1", "locked-6-7"} <= set(locked)
     assert "env.learner.locked=[6,7]" in locked["locked-6-7"]
+
+
+def test_no_real_arm_is_trained_on_where_it_is_unseen(compose):
+    named = {
+        case.name: compose("train", case.arguments).env for case in study.cases("paper") if case.group == "unseen_arms"
+    }
+    assert len(named) == 2 * len(study.STUDY["real"]) == 16
+    for name in study.STUDY["real"]:
+        arms, alone = named[f"{name}-unseen"].arms, named[f"{name}-alone"]
+        assert arms.evaluated == [name] and {*arms.models, name} == set(study.STUDY["real"]) and name not in arms.models
+        assert (alone.learner.model, alone.metric, alone.action_scale) == (
+            *(name, named[f"{name}-unseen"].metric, named[f"{name}-unseen"].action_scale),
+        )
 
 
 def test_the_variants_change_the_metric_as_they_are_named(compose):

@@ -194,6 +194,10 @@ def test_mjx_agrees_with_the_fused_loop():
         ),
         ({"observation": {"terms": ["distance_gradient"]}}, "observation.terms: expected none with an inner loop"),
         ({"randomization": {"torque_noise": 0.1}}, "randomization.torque_noise: expected 0 with an inner loop"),
+        (
+            {"world": {"expert": "links", "hidden_links": [0, 7]}, "control": "torque"},
+            "fewer than the expert's 7 links",
+        ),
         ({"control": "velocity"}, "control: expected one of torque, joint_position"),
         ({"learner": "panda_pair", "expert": "panda_pair"}, "expected a serial arm"),
     ],
@@ -209,6 +213,8 @@ def test_what_does_not_fit_is_rejected(fields, message):
         ({"payload": [2.0, 1.0]}, r"world.payload: expected \[minimum, maximum\], got \[2.0, 1.0\]"),
         ({"gravity_error": [0.0, 0.1]}, "world: expected gravity=true with gravity_error or contacts"),
         ({"action_delay": [0, 4]}, "world.action_delay: expected"),
+        ({"expert": "hidden"}, "world.expert: expected one of exact, links, points"),
+        ({"expert_loss": 0.1}, "world.expert: expected links or points"),
     ],
 )
 def test_worlds_out_of_range_are_rejected(fields, message):

@@ -55,11 +55,10 @@ def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable
             f"trainer={config.name} with {'an' if trained.env.kind == 'inner_loop' else 'no'} inner loop"
         )
     check_supported(trained.env.control, trained.env.control_dt)
-    if trained.env.world is not None and trained.env.world.history:
-        raise ValueError(
-            "format=controller: expected a run of env.world.history=0, whose policy needs no past measurements, got "
-            f"{trained.env.world.history}"
-        )
+    for key, expected in (("history", 0), ("expert", "exact")):  # a robot's controller knows neither past nor noise
+        value = getattr(trained.env.world, key)
+        if value != expected:
+            raise ValueError(f"format=controller: expected a run of env.world.{key}={expected}, got {value}")
     steps = check_checkpoint(run_dir, checkpoint)
     env = cast(HardwareEnv, run_environment(trained.env, run_dir)[0])
     template = ppo.params_template(config, env.observation_size, env.action_size, env.privileged_size)
