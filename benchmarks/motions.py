@@ -39,7 +39,7 @@ from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import load_config
 
 SETS = "test", "new", "long"
-CONTROLLERS = "copy_joints", "pd", "computed_torque", "one_step", "nearest_pose"
+CONTROLLERS = "copy_joints", "pd", "computed_torque", "one_step", "nearest_pose", "mpc"
 COLUMNS = "env set kind controller gap:.2% low:.2% high:.2% seeds demonstrations centre_line:.4f hand:.3f"
 LONG, WINDOW = 300, 50  # steps
 RADIUS, PERIOD = 0.08, 4.0  # m and s, of the circle

@@ -89,7 +89,9 @@ def kinds_of_motions(training: Results) -> list[Cells]:
 
 def unseen_motions(motions: Results) -> list[Cells]:
     """Gap of the policy and of controllers without learning on each set and kind of motions, by environment."""
-    names = ("copy_joints", "one_step", "nearest_pose", "computed_torque")
+    controllers = {row["controller"] for row in motions["rows"]}
+    known = ("copy_joints", "one_step", "nearest_pose", "mpc", "computed_torque")
+    names = [name for name in known if name in controllers]
     rows: list[Cells] = [("joints", "motions", "policy: gap, 95 % interval [%]", *(f"`{name}`" for name in names))]
     keys = dict.fromkeys((row["env"], row["set"], row["kind"]) for row in motions["rows"])
     for env, which, kind in keys:

@@ -26,7 +26,7 @@ ROBOT_WORLDS = ("nominal", "hardware")
 ROBOTS = ("virtual_panda", "virtual_robot")
 ROBOT_LOOPS = ("mimic", "ruckig")
 CONTROLLERS = (
-    "policy", "hold", "copy_joints", "pd", "computed_torque", "one_step", "nearest_pose", "tracking"
+    "policy", "hold", "copy_joints", "pd", "computed_torque", "one_step", "nearest_pose", "mpc", "tracking"
 )  # fmt: skip
 ROBOT_CONTROLLERS = ("policy", "tracking")
 ARM_SIDES = ("left", "right")

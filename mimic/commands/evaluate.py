@@ -26,7 +26,7 @@ from mimic.trainers.trainer import Trainer
 
 CONTROLLERS_OF_MANY = ("policy", "nearest_pose")
 # For actions that are torques, and for those that are other targets of an inner loop.
-TORQUE_CONTROLLERS = ("copy_joints", "pd", "computed_torque", "one_step", "nearest_pose")
+TORQUE_CONTROLLERS = ("copy_joints", "pd", "computed_torque", "one_step", "nearest_pose", "mpc")
 TARGET_CONTROLLERS = ("tracking",)
 
 

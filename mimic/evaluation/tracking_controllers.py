@@ -17,6 +17,7 @@ from mimic.envs.world_env import HardwareEnv
 from mimic.envs.world_state import HardwareState
 from mimic.evaluation.evaluator import Controller, Evaluator, Motions, Rollouts
 from mimic.evaluation.nearest_pose_controller import nearest_pose_controller
+from mimic.evaluation.predictive_controller import predictive_controller
 from mimic.physics import dynamics
 from mimic.physics.joint_numbers import joints_of_model
 from mimic.retargeting.motions import largest_jump, optimal_motions
@@ -43,6 +44,7 @@ def run_controller(evaluator: Evaluator, name: str) -> tuple[Rollouts, dict[str,
     - "copy_joints": the same feedback as "computed_torque" along the expert's own angles of the joints that both have.
     - "one_step": the torque that brings the arm to the pose of the kinematic bound at the end of each step, by exact
       dynamics.
+    - "mpc": torques that minimise the metric over the next steps that a policy observes, see `predictive_controller`.
     - "tracking": targets of an inner loop along the poses of the kinematic bound, see `tracking_controller`.
 
     "pd", "computed_torque" and "copy_joints" are critically damped. Of several frequencies, and of several leads of
@@ -64,8 +66,8 @@ def run_controller(evaluator: Evaluator, name: str) -> tuple[Rollouts, dict[str,
     if name == "hold":
         zero = jnp.zeros(env.action_size)
         return jax.jit(lambda: evaluator.rollout(lambda state: zero))(), {"frequency_rad_s": 0.0}
-    if name == "nearest_pose":
-        controller = nearest_pose_controller(env)
+    if name in ("nearest_pose", "mpc"):
+        controller = (nearest_pose_controller if name == "nearest_pose" else predictive_controller)(env)
         return jax.jit(lambda: evaluator.rollout(controller))(), {"frequency_rad_s": 0.0}
     if name == "tracking":
         rollouts, lead = run_tracking(evaluator)

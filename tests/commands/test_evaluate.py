@@ -133,9 +133,9 @@ def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
     ("arguments", "message"),
     [
         (
-            ["controller=mpc"],
+            ["controller=lqr"],
             "controller: expected one of policy, hold, copy_joints, pd, computed_torque, one_step, nearest_pose, "
-            "tracking, got 'mpc'",
+            "mpc, tracking, got 'lqr'",
         ),
         (["physics=bullet"], "physics: expected one of mjx, fused, got 'bullet'"),
         (["split=validation"], "split: expected one of test, got 'validation'"),

@@ -184,7 +184,7 @@ def test_what_the_safety_layer_cannot_run_is_rejected(tmp_path, settings, messag
             "policy, hold or tracking for a run with an inner loop and control=joint_velocity",
         ),
         ({"world": "nominal", "control": "torque"}, "tracking", "policy or hold for a run with an inner loop and"),
-        ({}, "tracking", "policy, .*one_step or nearest_pose for a run with no inner loop"),
+        ({}, "tracking", "policy, .*nearest_pose or mpc for a run with no inner loop"),
     ],
 )
 def test_controllers_whose_commands_the_run_does_not_have(settings, controller, message):
