@@ -13,6 +13,8 @@ import mimic
 from mimic.commands import hand_reach
 from mimic.commands.hand_reach import HandReach
 from mimic.metric.config import MetricConfig
+from mimic.retargeting.base_placement import repeated
+from mimic.retargeting.hand_speeds import hand_jacobians
 from tests.helpers import original_model
 
 
@@ -36,7 +38,7 @@ def test_the_velocities_of_a_hand_are_those_of_mujoco(arm, poses):
     mujoco.mj_kinematics(model, data)
     last = model.joint(embodiment.joint_names[-1]).bodyid[0]
     local = data.xmat[last].reshape(3, 3).T @ (arm.ends[0].point - data.xpos[last])
-    for pose, found in zip(poses, hand_reach._jacobians(embodiment, poses), strict=True):
+    for pose, found in zip(poses, hand_jacobians(embodiment, poses), strict=True):
         data.qpos[:] = pose
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -51,10 +53,11 @@ def test_the_speed_that_is_kept_is_the_ratio_of_the_limits(arm, poses):
     expert, exact = arm.embodiment, np.ones(len(poses), bool)
     learner = dataclasses.replace(expert, velocity_limit=np.full(6, np.pi / 3))
     expert = dataclasses.replace(expert, velocity_limit=np.full(6, np.pi))
-    assert hand_reach._speed((expert, expert), poses, poses, 0.0, exact) == pytest.approx(1, abs=1e-4)
+    in_place, turned_base = (repeated(np.array([[0, 0, 0, yaw]]), len(poses)) for yaw in (0.0, 1.1))
+    assert hand_reach._speed((expert, expert), poses, poses, in_place, exact) == pytest.approx(1, abs=1e-4)
     turned = poses - [1.1, 0, 0, 0, 0, 0]  # about the vertical: the hand stays where it is
-    assert hand_reach._speed((expert, learner), poses, turned, 1.1, exact) == pytest.approx(1 / 3, abs=1e-4)
-    position = hand_reach._speed((expert, learner), poses, poses, 0.0, ~exact)
+    assert hand_reach._speed((expert, learner), poses, turned, turned_base, exact) == pytest.approx(1 / 3, abs=1e-4)
+    position = hand_reach._speed((expert, learner), poses, poses, in_place, ~exact)
     assert position.mean() > 0.4  # the linear velocity alone takes less
 
 
