@@ -7,7 +7,8 @@ person. Episodes: the recorded leader (SO-101) drives a Piper, at the recorded r
 `recorded` follower is what the recording's own mapping did. `bound`: fraction of the frames with an embodiment distance
 within 5 % of that of `imitate_pose`, which has no limits of speed. Sweeps: a leader wanders through all of its joint
 ranges, while 30 % of the samples are lost, stall for 2 s, jump, are not finite, or have times that run backwards.
-Limits are checked by differences of the commands; `recovery` is the time from the first good sample after a fault to
+Limits are checked by differences of the commands, and `clearance_mm` is the smallest distance of capsules around the
+follower's links, where its model has shapes; `recovery` is the time from the first good sample after a fault to
 the first command that follows samples again. Times: of one step, beside a fixed loop of NumPy on the same core, ssik's
 Tracker and mink.
 """
@@ -28,16 +29,19 @@ from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.exact_hands import SPEEDS, as_numbers, hand_matrices, homogeneous, joint_motions
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment, load_mjcf
+from mimic.control.clearance import clearance
+from mimic.metric.capsule_distances import clearance_constants
 from mimic.metric.config import MetricConfig
 from mimic.motions.importing import read_source, source_names
 from mimic.motions.units import in_rad
 from mimic.retargeting.hand_target import placement
+from mimic.retargeting.self_contacts import SelfContacts
 
 EPISODES = (
     "method rate frames position_mm_p95:.2f hand_direction_deg:.2f bound:.1% of_limits:.3f stalled_s:.2f elbow:.3f "
     "plane_deg:.1f"
 )
-SWEEPS = "pair steps not_finite beyond_mrad:.6f of_limits:.4f recovery_s:.2f holding:.1%"
+SWEEPS = "pair steps not_finite beyond_mrad:.6f of_limits:.4f recovery_s:.2f holding:.1% clearance_mm:.1f"
 TIMES = "method p50_ms:.3f p99_ms:.3f p999_ms:.3f core_us_p50:.1f core_us_p99:.1f"
 # rad/s (data sheets); Piper's model states 0 for its first joint, those of robosuite nothing.
 SPEED = {
@@ -53,15 +57,24 @@ _RATE, _LOST = 100.0, 0.3  # Hz; fraction of samples that are lost
 _TIMED = 3  # episodes
 
 
-def arm(name: str, options: argparse.Namespace) -> Embodiment:
+def config(name: str, options: argparse.Namespace) -> ArmConfig:
     files = {
         "so101": options.data / "arms/so101/so101_new_calib.urdf",
         "piper": options.data / "arms/piper.urdf",
         "ur5e": options.robots / "ur5e/robot.xml",
     }
-    if name == "panda":
-        return mimic.panda(limits="hardware")
-    return build_arm(ArmConfig(model=str(files[name])), "hardware").embodiment
+    return ArmConfig() if name == "panda" else ArmConfig(model=str(files[name]))
+
+
+def arm(name: str, options: argparse.Namespace) -> Embodiment:
+    return build_arm(config(name, options), "hardware").embodiment
+
+
+def clearance_of(operator: mimic.Teleoperator, capsules: mimic.Capsules) -> Callable[[np.ndarray], float]:
+    """The smallest distance [mm] of the follower's checked capsules on a path, by NumPy, as on a robot."""
+    pairs = SelfContacts(operator.follower, capsules).pairs
+    constants = clearance_constants(operator.follower, capsules, floor_height=-10.0, pairs=pairs)
+    return lambda path: 1e3 * float(clearance(path, constants).min())
 
 
 def person(clip: Path) -> tuple[Embodiment, np.ndarray]:
@@ -223,7 +236,9 @@ def sweep(name: str, options: argparse.Namespace, block: int = 20000) -> Row:
     follower, rng = arm(other, options), np.random.default_rng(PAIRS.index(name))
     leader, clip = person(options.clip) if one == "person" else (arm(one, options), None)
     scale = float(follower.chain_length / leader.chain_length)
-    operator = mimic.Teleoperator(leader, follower, scale=scale, velocity=SPEED[other], rate=_RATE)
+    capsules = None if other == "so101" else mimic.fit_capsules(config(other, options), "hardware")  # it has no shapes
+    operator = mimic.Teleoperator(leader, follower, scale=scale, velocity=SPEED[other], rate=_RATE, capsules=capsules)
+    smallest = clearance_of(operator, capsules) if capsules else None
     row: Row = {"pair": name, "steps": 0, "not_finite": 0, "violations": 0, "of_limits": 0.0, "beyond_mrad": -np.inf}
     recoveries, holding, begin = [], 0, None
     operator.engage()
@@ -236,6 +251,8 @@ def sweep(name: str, options: argparse.Namespace, block: int = 20000) -> Row:
         row |= {"steps": row["steps"] + block, "not_finite": row["not_finite"] + int((~np.isfinite(path)).sum())}
         row |= {"violations": row["violations"] + count, "of_limits": max(row["of_limits"], largest)}
         row["beyond_mrad"] = max(row["beyond_mrad"], beyond)
+        if smallest is not None:
+            row["clearance_mm"] = min(row.get("clearance_mm", np.inf), smallest(path))
     recovery = {"recoveries": len(recoveries), "recovery_s": max(recoveries), "holding": holding / row["steps"]}
     return as_numbers(row | recovery)
 

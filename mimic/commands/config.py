@@ -428,6 +428,7 @@ class ViewConfig:
       demonstrations: file of the expert's demonstrations to choose from. Default "": random ones are recorded.
       hand: how the learner's hand follows the expert's at the start: "free", "exact" or "relative", see `HandSettings`.
       base: where the learner's base then stands, see `base_numbers`.
+      record: new folder for what the hand drives, a LeRobot data set, written at the end. Default "": none.
       arm: "left" or "right" arm of the person in `source`. Default "": right.
       capture: how `source` is read.
       checkpoint: steps of the checkpoint of the policy or the mapper. Default None: the last checkpoint.
@@ -445,6 +446,7 @@ class ViewConfig:
     demonstrations: str = ""
     hand: str = "free"
     base: Any = "same"
+    record: str = ""
     arm: str = ""
     capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
     checkpoint: int | None = checkpoint_number()
@@ -469,8 +471,8 @@ class ViewConfig:
         if self.run:
             check_unused(self, ("demonstrations",), "with run=, whose motions are shown")
         check_choice("hand", self.hand, _FOLLOWED)
-        if self.hand != "free" and (self.run or self.mapper):
-            raise ValueError("hand: expected free with run= or mapper=, which move the learner")
+        if self.run or self.mapper:
+            check_unused(self, ("hand", "record"), "with run= or mapper=, which move the learner")
         if self.base != "same" and (self.hand == "free" or base_numbers(self.base) is None):
             raise ValueError(
                 "base: expected same or [x,y,z,yaw] with hand=exact or relative; inspect base=auto finds one"

@@ -2,6 +2,9 @@
 
 import contextlib
 import dataclasses
+import functools
+import importlib.util
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,11 +14,13 @@ from rich.console import Console
 
 from mimic.arms.arm import ArmConfig
 from mimic.base import compat
+from mimic.base.config import new_folder
 from mimic.base.distribution import install_command
 from mimic.commands.config import ViewConfig, base_numbers
 from mimic.commands.view_capture import (
     CapturedExpert,
     clip_expert,
+    hand_expert,
     is_address,
     listen,
     live_expert,
@@ -25,6 +30,8 @@ from mimic.commands.view_capture import (
 from mimic.commands.view_server import check_port, is_installed, serve
 from mimic.envs.config import EnvConfig
 from mimic.motions.demonstrations import load_demonstrations
+from mimic.motions.formats.episodes import package_error
+from mimic.motions.mocap.live_hand import LiveHand
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.run_config import policy_run
 from mimic.viewer.hand_following import HandSettings
@@ -52,6 +59,10 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
             f"{install_command('view')}"
         )
     check_port(config.host, config.port)
+    if config.record:
+        new_folder("record", config.record)
+        if importlib.util.find_spec("pyarrow") is None:
+            raise package_error("record", "pyarrow")
     from mimic.base.compilation import use_compilation_cache
 
     use_compilation_cache(config.compilation_cache)
@@ -64,7 +75,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     if config.source:
         return _prepare_captured(config, config.env)
     if not config.mapper:
-        return _prepare_live(config, config.env, LiveSession(config.env, hand=_hand(config)))
+        return _prepare_live(config, config.env, _session(config, config.env))
     return _prepare_mapper(config)
 
 
@@ -93,13 +104,27 @@ def _prepare_live(
         expert = ManualControls(session, env, demonstrations)
         show_live(page, times, session, env, expert, LearnerControls(session, page.starts, presets))
 
-    return lambda: serve(config, env, _title(config, env), show_session, None, session.finish, learners=learners)
+    after = functools.partial(_finish, config, session)
+    return lambda: serve(config, env, _title(config, env), show_session, None, after, learners=learners)
 
 
-def _hand(config: ViewConfig) -> HandSettings:
-    """How the learner's hand follows at the start."""
+def _session(config: ViewConfig, env: EnvConfig) -> LiveSession:
+    """A session whose learner's hand follows as the config says."""
     x, y, z, yaw = base_numbers(config.base) or [0.0] * 4
-    return HandSettings(config.hand, base=(x, y, z, yaw))
+    return LiveSession(env, hand=HandSettings(config.hand, base=(x, y, z, yaw)), is_recorded=bool(config.record))
+
+
+def _finish(config: ViewConfig, session: LiveSession) -> None:
+    """Ends a session, and writes what the hand drove; further data sets have numbers."""
+    session.finish()
+    number = 0
+    for recorder in session.driven:
+        while os.path.lexists(folder := f"{config.record}-{number}" if number else config.record):
+            number += 1
+        recorder.write(folder)
+        print(f"view: {recorder.episodes} episodes in {folder}", flush=True)
+    if config.record and not session.driven:
+        print("view: record: nothing was driven, as by hand=relative or the tab 'Hand'", flush=True)
 
 
 def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
@@ -149,7 +174,8 @@ def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
     """Checks the captured person of `source`; the returned function shows it."""
 
     def show(expert: CapturedExpert) -> int:
-        live = LiveSession(expert.env, hand=_hand(config))
+        live = _session(config, expert.env)
+        after = functools.partial(_finish, config, live)
 
         def show_session(page: "Page", times: Iterator[float]) -> None:
             from mimic.viewer.learner_controls import LearnerControls
@@ -158,7 +184,7 @@ def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
             learner = LearnerControls(live, page.starts)
             show_live(page, times, live, expert.env, expert.controls(live), learner, _NUMBERS_RATE)
 
-        return serve(config, expert.env, _title(config, expert.env), show_session, None, live.finish, rate=CAPTURE_RATE)
+        return serve(config, expert.env, _title(config, expert.env), show_session, None, after, rate=CAPTURE_RATE)
 
     if is_address(config.source):
         listener = listen(config)
@@ -168,6 +194,8 @@ def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
                 measured = wait_for_arm(listener, config, env)
                 if measured is None:
                     return 0
+                if isinstance(measured, LiveHand):
+                    return show(hand_expert(env, listener))
                 with live_expert(env, *measured, listener) as expert:
                     return show(expert)
 

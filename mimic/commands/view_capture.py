@@ -21,10 +21,11 @@ from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
 from mimic.motions.mocap.clips import slow_down_for
 from mimic.motions.mocap.conventions import UNITS
 from mimic.motions.mocap.link_motion import LinkMotion
+from mimic.motions.mocap.live_hand import LiveHand
 from mimic.motions.mocap.live_points import LiveArm, Sample, live_body
 from mimic.motions.mocap.point_socket import PointListener
 from mimic.runs.signals import Signals, noted_signals
-from mimic.viewer.captured import Clip, ClipPlayer, PointTracker, Said, make_clip
+from mimic.viewer.captured import Clip, ClipPlayer, HandTracker, PointTracker, Said, make_clip
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.origins import is_local
 
@@ -127,8 +128,26 @@ def live_expert(env: EnvConfig, arm: LiveArm, links: LinkMotion, listener: Point
     print(f"view: {tracker.summary}", flush=True)
 
 
-def wait_for_arm(listener: PointListener, config: ViewConfig, env: EnvConfig) -> tuple[LiveArm, LinkMotion] | None:
+def hand_expert(env: EnvConfig, listener: PointListener) -> CapturedExpert:
+    """The expert of an environment, whose hand the poses of a person's hand move.
+
+    Raises:
+      ValueError: an expert without a known hand.
+    """
+    from mimic.viewer.capture_controls import PointControls
+
+    expert = build_arm(env.expert, env.limits).embodiment
+    if not expert.hand_joint:
+        raise ValueError(f"expert: expected an arm whose hand is known, which poses of a hand move, got {expert.name}")
+    return CapturedExpert(env, lambda session: PointControls(session, HandTracker(listener)))
+
+
+def wait_for_arm(
+    listener: PointListener, config: ViewConfig, env: EnvConfig
+) -> tuple[LiveArm, LinkMotion] | LiveHand | None:
     """The arm of the person whose points arrive, and its links in the first samples; None after a signal.
+
+    A hand is returned as it is.
 
     Points that are no arm's print a line, and it waits for others.
     """
@@ -144,6 +163,8 @@ def wait_for_arm(listener: PointListener, config: ViewConfig, env: EnvConfig) ->
             if (sample := listener.take()) is None:
                 time.sleep(_POLL)
                 continue
+            if sample.hand is not None:
+                return sample.hand
             try:
                 arm = arm or _live_arm(sample, side, config.capture)
                 if arm.has_all(sample):

@@ -5,13 +5,14 @@ start the nearest to the leader's posture may soon be at a limit, so a search ca
 the leader's joints, one after the other both ways within its range, and the branch that follows best is taken.
 """
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.retargeting.live_pose import FAR, ArmRows, Goal, LivePose
+from mimic.retargeting.self_contacts import SelfContacts
 
 _LANES, _STEPS = 12, 25  # random postures, and steps of each
 _LANES_ON_THE_WAY = 4  # while the follower follows, where a tick must not take long
@@ -19,6 +20,7 @@ _STRIDE = 0.5  # rad, the longest step of a joint
 _ALIKE, _AS_GOOD = 0.3, 2e-6  # rad: postures of one branch; cost above the least of branches that are compared
 _MAX_BRANCHES = 4
 _AHEAD, _STEPS_AHEAD = (0.15, 0.3, 0.45, 0.6, 0.8, 1.0), 2  # rad that a joint of the leader turns, and steps for each
+_TOUCHING = 10.0  # added to the cost of postures in which links touch
 _PERPENDICULAR = 0.1  # cosine of axes that count as that
 
 
@@ -28,7 +30,8 @@ class BranchSearch:
     Args:
       pose, rows: of its steps.
       follower: the arm.
-      follower_range, leader_range: [joints, 2] of their joints [rad].
+      joint_range: [joints, 2] of its joints [rad].
+      contacts: of its links, if these are checked; postures in which they touch come last.
     """
 
     def __init__(
@@ -36,13 +39,13 @@ class BranchSearch:
         pose: LivePose,
         rows: ArmRows,
         follower: Embodiment,
-        follower_range: Float[np.ndarray, "joints 2"],
-        leader_range: Float[np.ndarray, "leader_joints 2"],
+        joint_range: Float[np.ndarray, "joints 2"],
+        contacts: SelfContacts | None = None,
     ):
-        self._pose, self._follower, self._range = pose, rows, np.asarray(follower_range, float)
+        self._pose, self._follower, self._range, self._contacts = pose, rows, np.asarray(joint_range, float), contacts
         self._middle = np.clip(self._range, -2 * np.pi, 2 * np.pi).mean(axis=1)
         self._wrists = list(_wrists(follower))
-        self._leader_range, self._random = np.asarray(leader_range, float), np.random.default_rng(0)
+        self._random = np.random.default_rng(0)
 
     def search(
         self, posture: Float[np.ndarray, " joints"], goal: Callable[[], Goal]
@@ -54,35 +57,31 @@ class BranchSearch:
           goal: gives the goal of the next step.
         """
         lanes = yield from self._settled(self._spread(posture, _LANES_ON_THE_WAY), goal)
-        costs = self._pose.cost(goal(), self._follower(lanes))
+        costs = self._costs(goal(), lanes)
         yield lanes[costs.argmin()], float(costs.min())
 
     def search_ahead(
         self,
         posture: Float[np.ndarray, " joints"],
         goal: Callable[[], Goal],
-        sample: Callable[[], Float[np.ndarray, " leader_joints"]],
-        goal_of: Callable[[Float[np.ndarray, " leader_joints"]], Goal],
+        ways: Sequence[Callable[[float], Goal]],
     ) -> Iterator[tuple[np.ndarray, float] | None]:
         """As `search`, with the branch that follows the leader's next motion best.
 
         Args:
           posture, goal: see `search`.
-          sample: gives the leader's pose [rad].
-          goal_of: the goal of a pose of the leader.
+          ways: goals that the leader would have after each of its next motions, by how far it moves [rad].
         """
         lanes = yield from self._settled(self._spread(posture), goal)
-        best = lanes[self._pose.cost(goal(), self._follower(lanes)).argmin()]
+        best = lanes[self._costs(goal(), lanes).argmin()]
         flipped = self._flipped(best)
         lanes = yield from self._settled(np.concatenate([flipped, self._spread(best)[len(flipped) :]]), goal)
-        lanes = self._branches(lanes, self._pose.cost(goal(), self._follower(lanes)))
+        lanes = self._branches(lanes, self._costs(goal(), lanes))
         losses = np.zeros(len(lanes))
-        ways = np.concatenate([np.eye(len(self._leader_range)), -np.eye(len(self._leader_range))])
         for way in ways if len(lanes) > 1 else ():
-            ahead, here = lanes, sample()
-            lower, upper = np.minimum(self._leader_range[:, 0], here), np.maximum(self._leader_range[:, 1], here)
+            ahead = lanes
             for angle in _AHEAD:
-                of_way = goal_of(np.clip(here + angle * way, lower, upper))
+                of_way = way(angle)
                 for _ in range(_STEPS_AHEAD):
                     ahead = self._step(of_way, ahead)
                 losses += self._pose.cost(of_way, self._follower(ahead))
@@ -90,6 +89,10 @@ class BranchSearch:
         costs = self._pose.cost(goal(), self._follower(lanes))
         best = losses.argmin()
         yield lanes[best], float(costs[best])
+
+    def _costs(self, goal: Goal, lanes: np.ndarray) -> np.ndarray:
+        costs = self._pose.cost(goal, self._follower(lanes))
+        return costs if self._contacts is None else costs + _TOUCHING * self._contacts.touch(lanes)
 
     def _spread(self, posture: np.ndarray, lanes: int = _LANES) -> np.ndarray:
         """Random postures [lanes, joints], of which the first is this one."""

@@ -24,6 +24,7 @@ _LEVER = 0.5
 _SMOOTHING = 1e-2  # chain lengths below which a distance of links is a square
 FAR, NEAR = 0.3, 0.03  # chain lengths, the longest pulls on hands: of a search, and of a follower
 _PASSES = 3  # of a step, each without the joints that the last one moved to the edge of the box
+_STIFF, _ON_WALL = 1e3, 1e-7  # of walls, beside 1 of the hand's position; m beyond them
 
 
 class Goal(NamedTuple):
@@ -84,7 +85,7 @@ class ArmRows:
         self.moving, self._hand_axes = slice(edges[2], None), edges[-1]
         of_rows = [*arm.link_joint, *arm.link_joint, *hand_joint, *np.repeat(hand_joint, 3)]
         is_point = np.repeat([1.0, 0.0, 1.0, 0.0], [links, links, hands, 3 * hands])
-        moves = [[_is_ancestor(arm, joint, row) for row in of_rows] for joint in range(self._joints)]
+        moves = [[is_ancestor(arm, joint, row) for row in of_rows] for joint in range(self._joints)]
         self._moves, self._is_point = np.array(moves, float)[:, :, None], is_point[:, None]
 
     def __call__(self, qpos: Float[np.ndarray, "lanes joints"]) -> Rows:
@@ -103,32 +104,40 @@ class ArmRows:
 
     def jacobian(self, rows: Rows) -> Float[np.ndarray, "lanes joints moving 3"]:
         """Derivatives of the moving rows with respect to the joint angles."""
-        cross = (rows[:, self.axes] @ _LEVI_CIVITA).reshape(-1, self._joints, 3, 3)
+        cross = (rows[:, self.axes] @ LEVI_CIVITA).reshape(-1, self._joints, 3, 3)
         return ((rows[:, None, self.moving] - self._is_point * rows[:, self.anchors, None]) @ cross) * self._moves
 
 
-_LEVI_CIVITA = np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)  # v @ (a @ this) is a x v
+LEVI_CIVITA = np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)  # v @ (a @ this) is a x v
 
 
 def _model(
     arm: Embodiment, site_joint: Sequence[int], positions: np.ndarray, rotations: np.ndarray, unit: float
 ) -> mujoco.MjModel:
     """Joints of an arm and sites that move with them, named by their numbers, in units of a length."""
+    spec, bodies = joint_spec(arm, unit)
+    for site, (joint, position, rotation) in enumerate(zip(site_joint, positions, rotations, strict=True)):
+        quaternion, (body, origin) = np.zeros(4), bodies[joint + 1]
+        mujoco.mju_mat2Quat(quaternion, np.asarray(rotation, float).ravel())
+        body.add_site(name=str(site), pos=position / unit - origin, quat=quaternion)
+    return spec.compile()
+
+
+def joint_spec(arm: Embodiment, unit: float) -> tuple[mujoco.MjSpec, list[tuple[Any, np.ndarray]]]:
+    """A model of an arm's joints, named by their numbers, in units of a length [m].
+
+    Returns:
+      The model, and its bodies, the base's first, with their origins in the zero pose.
+    """
     spec = mujoco.MjSpec()
     spec.compiler.autolimits, spec.compiler.degree = False, False
-    bodies, origins = [spec.worldbody], [np.zeros(3)]
+    bodies: list[tuple[Any, np.ndarray]] = [(spec.worldbody, np.zeros(3))]
     for joint, parent in enumerate(arm.joint_parent):
-        anchor = np.asarray(arm.joint_anchor[joint], float) / unit
-        body = bodies[parent + 1].add_body(
-            pos=anchor - origins[parent + 1], mass=1.0, inertia=np.ones(3), explicitinertial=True
-        )
-        body.add_joint(name=str(joint), axis=np.asarray(arm.joint_axis[joint], float))
-        bodies, origins = [*bodies, body], [*origins, anchor]
-    for site, (joint, position, rotation) in enumerate(zip(site_joint, positions, rotations, strict=True)):
-        quaternion = np.zeros(4)
-        mujoco.mju_mat2Quat(quaternion, np.asarray(rotation, float).ravel())
-        bodies[joint + 1].add_site(name=str(site), pos=position / unit - origins[joint + 1], quat=quaternion)
-    return spec.compile()
+        anchor, (body, origin) = np.asarray(arm.joint_anchor[joint], float) / unit, bodies[parent + 1]
+        child = body.add_body(pos=anchor - origin, mass=1.0, inertia=np.ones(3), explicitinertial=True)
+        child.add_joint(name=str(joint), axis=np.asarray(arm.joint_axis[joint], float))
+        bodies.append((child, anchor))
+    return spec, bodies
 
 
 def _hands(arm: Embodiment) -> tuple[np.ndarray, np.ndarray, list[int]]:
@@ -144,7 +153,7 @@ def _hands(arm: Embodiment) -> tuple[np.ndarray, np.ndarray, list[int]]:
     return np.array(ends), rotation, [arm.link_joint[link] for link in last]
 
 
-def _is_ancestor(arm: Embodiment, joint: int, other: int) -> bool:
+def is_ancestor(arm: Embodiment, joint: int, other: int) -> bool:
     """Whether a joint moves what another one moves."""
     while other > joint:
         other = arm.joint_parent[other]
@@ -256,6 +265,7 @@ class LivePose:
         longest: float = NEAR,
         left: float = FAR,
         rows: Rows | None = None,
+        walls: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> Float[np.ndarray, "lanes joints"]:
         """Joint angles within the box [lower, upper] after a step.
 
@@ -265,6 +275,8 @@ class LivePose:
           lower, upper: of the box [rad].
           longest, left: see `pulls`.
           rows: at these angles, where they are known.
+          walls: gradients [walls, joints] and bounds [walls]: the step's products with the gradients are at least
+            these, as far as the box lets them; of a single lane.
         """
         rows = self._follower(qpos) if rows is None else rows
         force, stiffness, damping = self.pulls(goal, rows, longest, left)
@@ -272,14 +284,25 @@ class LivePose:
         flat = columns.reshape(*columns.shape[:2], -1)
         gradient = (flat @ force.reshape(len(qpos), -1, 1))[..., 0]
         hessian = (columns * stiffness[:, None, :, None]).reshape(flat.shape) @ flat.swapaxes(1, 2)
-        return qpos + self._step_in_box(hessian, damping, gradient, lower - qpos, upper - qpos)
+        joints, (lower, upper) = hessian.shape[-1], (lower - qpos, upper - qpos)
+        hessian.reshape(-1, joints * joints)[:, :: joints + 1] += damping[:, None]
+        step = self._step_in_box(hessian, gradient, lower, upper)
+        if walls is not None:
+            normals, bounds = walls
+            for _ in range(_PASSES):
+                beyond = (step[0] @ normals.T < bounds - _ON_WALL) * _STIFF
+                if not beyond.any():
+                    break
+                hessian += (beyond * normals.T) @ normals
+                gradient -= (beyond * bounds) @ normals
+                step = self._step_in_box(hessian, gradient, lower, upper)
+        return qpos + step
 
     def _step_in_box(
-        self, hessian: np.ndarray, damping: np.ndarray, gradient: np.ndarray, lower: np.ndarray, upper: np.ndarray
+        self, hessian: np.ndarray, gradient: np.ndarray, lower: np.ndarray, upper: np.ndarray
     ) -> np.ndarray:
-        """The minimum of a damped quadratic function in a box, where joints that reach an edge stay there."""
+        """The minimum of a quadratic function in a box, where joints that reach an edge stay there."""
         joints = hessian.shape[-1]
-        hessian.reshape(-1, joints * joints)[:, :: joints + 1] += damping[:, None]
         right = -gradient
         step, free = self._solve(hessian, right), 1.0
         for _ in range(_PASSES):

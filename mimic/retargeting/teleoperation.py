@@ -1,10 +1,11 @@
-"""Live teleoperation: a leader arm drives a follower of another build, tick by tick.
+"""Live teleoperation: a leader arm, a person or a hand drives a follower of another build, tick by tick.
 
 Each tick has three stages. A sample of the leader is checked, and gives a goal of the follower's hand. The posture
 takes steps to this goal within the velocity limits, see `mimic.retargeting.live_pose`; it never jumps to another
 branch. The command follows the posture by Ruckig's online trajectories, within all limits and always able to stop.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -12,23 +13,22 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
-from mimic.arms.pose_limits import continuous_joints
 from mimic.base.config import check_choice
 from mimic.base.distribution import install_command
 from mimic.control.limits import JointLimits, joint_limits
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.branch_search import BranchSearch
 from mimic.retargeting.hand_target import matched_hands, placement
+from mimic.retargeting.leaders import ArmLeader, HandLeader, Samples
 from mimic.retargeting.live_pose import FAR, NEAR, ArmRows, Goal, LivePose
-from mimic.retargeting.pose import wrap_angles
+from mimic.retargeting.self_contacts import Near, SelfContacts
 
 HANDS = ("exact", "relative")
 STATES = ("tracking", "nearest", "catching up", "approaching", "holding", "waiting", "disengaged")
 _TOLERANCE = 1e-3, np.radians(0.5)  # m, rad: hands that are nearer count as reached
 _STEP_TIME, _MAX_STEPS = 0.015, 5  # s of a tick for each step of the posture, and steps at most
-_MAX_SPEED = 4 * np.pi  # rad/s of a leader; a sample that moved faster is a jump
-_PATIENCE = 0.12  # s after which samples that agree with each other count, though they jumped or time ran backwards
 _TIMEOUT = 0.2  # s without a sample, after which the follower is said to hold
 _FREE, _SPEED_TIME = 0.8, 0.03  # of the velocity limits: below, the path's speed counts, smoothed over this time [s]
 _APPROACH = 0.5  # of the velocity limits, on the way to another posture
@@ -37,6 +37,8 @@ _BRAKING = 0.5  # of twice the acceleration: what a joint needs to stop before i
 _GRIPPER_TIME = 0.25  # s at least from closed to open
 _STUCK = 0.3  # s with a hand that is not reached, after which another branch is searched
 _LINE, _DETOUR = 16, 1.1  # points of a straight way to another branch; it may increase the hand's cost so much
+_SLOWING, _RETREAT = 0.1, 0.05  # s in which links that come near each other lose 63 % of the room; m/s apart, at most
+_AT_WALL = 1e-6  # m
 
 
 class TeleoperationStatus(NamedTuple):
@@ -75,7 +77,8 @@ class Teleoperator:
     that are not finite, late, lost or out of order: the follower then holds its goal and says why.
 
     Args:
-      leader: the arm that gives the motion; without a known hand, as a person's, the end of its last link leads.
+      leader: the arm that gives the motion; without a known hand, as a person's, the end of its last link leads. With
+        None poses of the hands lead, as a headset gives them, and the posture is pulled to the follower's home pose.
       follower: the arm that is driven.
       hand: "exact" puts the hand where the leader's is; "relative" repeats the leader's motion since `engage`, from
         where the follower's hand was then (a clutch).
@@ -87,6 +90,7 @@ class Teleoperator:
       velocity: [joints] or one number, maximum speed [rad/s], for a model that states none.
       metric: of postures.
       grippers: (closed, open) of the leader and of the follower, in the units of each.
+      capsules: of the follower, from `fit_capsules`, to keep its links apart, see `SelfContacts`.
 
     Attributes:
       limits: of the follower.
@@ -99,7 +103,7 @@ class Teleoperator:
 
     def __init__(
         self,
-        leader: Embodiment,
+        leader: Embodiment | None,
         follower: Embodiment,
         *,
         hand: Literal["exact", "relative"] = "exact",
@@ -111,6 +115,7 @@ class Teleoperator:
         velocity: Any = None,
         metric: MetricConfig | None = None,
         grippers: tuple[Sequence[float], Sequence[float]] = ((0.0, 1.0), (0.0, 1.0)),
+        capsules: Capsules | None = None,
     ):
         check_choice("hand", hand, HANDS)
         for name, number in (("scale", scale), ("rate", rate)):
@@ -119,28 +124,31 @@ class Teleoperator:
         self.period, self._is_relative = 1.0 / rate, hand == "relative"
         self.limits = limits or follower_limits(follower, velocity)
         self.leader, self.follower = leader, follower
-        self._rows = ArmRows(leader), ArmRows(follower)
-        self._pairs = matched_hands(leader, follower)
-        self._pose = LivePose(*self._rows, self._pairs, (metric or MetricConfig()).build(leader, follower))
+        self._lower, self._upper = self.limits.position.T
+        home, own = np.clip(follower.home, self._lower, self._upper), ArmRows(follower)
         where, mirrored = placement(base), np.array([1.0, -1.0 if mirror else 1.0, 1.0])
-        self._to_base, of_leader, of_follower = mirrored[:, None] * where.rotation, *(rows.unit for rows in self._rows)
+        self._to_base = mirrored[:, None] * where.rotation
+        self._leads = HandLeader(follower, own, home, self._to_base) if leader is None else ArmLeader(leader)
+        self._rows, leads = (self._leads.rows, own), self._leads.arm
+        self._pairs = matched_hands(leads, follower)
+        self._pose = LivePose(*self._rows, self._pairs, (metric or MetricConfig()).build(leads, follower))
+        of_leader, of_follower = (rows.unit for rows in self._rows)
         self._factor = scale * of_leader / of_follower
         self._origin = where.rotation.T @ where.position / of_follower
         self._mirrored = np.tile(mirrored, len(self._pairs))[:, None] if mirror else None
         self._leader_hands, self._follower_hands = (
             rows.hand_rows(hands) for rows, hands in zip(self._rows, self._pairs.T, strict=True)
         )
-        self._samples = _Samples(leader, self.period)
+        self._samples = Samples(self._leads, self.period)
         self._gripper = _Gripper(*grippers, self.period)
         self._limiter = _Limiter(self.limits, self.period)
         self._steps = int(np.clip(np.ceil(self.period / _STEP_TIME), 1, _MAX_STEPS))
         self._smoothing = float(1 - np.exp(-self.period / _SPEED_TIME))
         self._reach = self.limits.velocity * self.period
-        self._lower, self._upper = self.limits.position.T
-        ranges = self.limits.position, leader.joint_range
-        self._branches = BranchSearch(self._pose, self._rows[1], follower, *ranges)
+        self._contacts = None if capsules is None else SelfContacts(follower, capsules)
+        self._branches = BranchSearch(self._pose, own, follower, self.limits.position, self._contacts)
         self.engagements = 0
-        self.reset(np.clip(follower.home, self._lower, self._upper))
+        self.reset(home)
 
     def reset(self, qpos: Float[np.ndarray, " joints"]) -> None:
         """Disengages, with the follower at rest at these angles [rad].
@@ -165,6 +173,7 @@ class Teleoperator:
         self._speed, self._posture_rows, self._is_reached = np.zeros_like(self._path), None, True
         self._left = FAR
         self._is_near, self._stuck, self._searched, self._is_chosen = self._is_relative, 0.0, None, False
+        self._held_apart = ""  # links of the follower that hold its posture back
 
     def disengage(self) -> None:
         """Brakes the follower, which then stays where it is."""
@@ -177,8 +186,8 @@ class Teleoperator:
         return self._limiter.qpos
 
     @property
-    def leader_qpos(self) -> Float[np.ndarray, " leader_joints"] | None:
-        """The last sample that counted [rad]; None before the first one since `engage`."""
+    def leader_qpos(self) -> np.ndarray | None:
+        """The last sample that counted; None before the first one since `engage`."""
         return None if self._goal is None else self._samples.last
 
     @property
@@ -194,7 +203,8 @@ class Teleoperator:
         """The command of the next tick.
 
         Args:
-          leader_qpos: [leader_joints] angles [rad]; None where no sample arrived.
+          leader_qpos: [leader_joints] angles [rad], or poses [hands, 4, 4] of the hands [m] where no arm leads; None
+            where no sample arrived.
           gripper: of the leader, in the units of its range; None where unknown.
           time: of the sample [s], on a clock of the leader; None to take each sample as new.
 
@@ -219,8 +229,7 @@ class Teleoperator:
 
     def _goal_of(self, sample: np.ndarray) -> Goal:
         """The goal of a sample of the leader."""
-        leader, follower = self._rows
-        rows, pairs = leader(sample[None])[0].dot(self._to_base), len(self._pairs)
+        rows, pairs = self._leads.of_sample(sample).dot(self._to_base), len(self._pairs)
         hands = rows.take(self._leader_hands, axis=0)
         position, axes = hands[:pairs], hands[pairs:]  # parts of the same array
         position *= self._factor
@@ -230,7 +239,7 @@ class Teleoperator:
                 axes *= self._mirrored
             return self._pose.goal(rows, hands)
         if self._anchor is None:
-            self._anchor = hands.copy(), follower(self._path[None])[0].take(self._follower_hands, axis=0)
+            self._anchor = hands.copy(), self._rows[1](self._path[None])[0].take(self._follower_hands, axis=0)
         then, start = self._anchor
         position += start[:pairs] - then[:pairs]
         # Rows are axes: the rotation since then, R R_then^T, acts on each axis of the start.
@@ -243,14 +252,17 @@ class Teleoperator:
         """Moves the posture towards the goal, and the path towards the posture."""
         reach, posture, rows, last = self._reach, self._posture[None], self._posture_rows, self._posture
         lower, upper = np.maximum(self._lower, last - reach), np.minimum(self._upper, last + reach)
+        self._held_apart = ""
         for _ in range(self._steps):
-            posture = self._pose.step(goal, posture, lower, upper, NEAR, self._left, rows)
+            near, walls = self._walls(posture[0], self._steps)
+            before, posture = posture, self._pose.step(goal, posture, lower, upper, NEAR, self._left, rows, walls)
+            self._hold_apart(near, walls, posture[0] - before[0])
             rows = None
         self._posture, follows = posture[0], self._path is last
         moved = self._posture - last
         fraction = float(np.abs(moved / reach).max())
-        # A path that goes as fast as it may ends at once, where the command must be able to stop.
-        is_free = self._is_near and fraction < _FREE
+        # A path that goes as fast as it may ends at once, where the command must be able to stop, as one at a wall.
+        is_free = self._is_near and fraction < _FREE and not self._held_apart
         kept = 1 - self._smoothing
         self._speed = kept * self._speed + self._smoothing / self.period * moved if is_free else 0 * moved
         self._search(goal)
@@ -260,7 +272,27 @@ class Teleoperator:
             moved = self._posture - self._path
             fraction = float(np.abs(moved / reach).max()) / (1.0 if self._is_near else _APPROACH)
             self._is_near |= fraction <= 1
-        self._path = self._posture if fraction <= 1 else self._path + moved / fraction
+            moved /= max(fraction, 1.0)
+            near, walls = self._walls(self._path)
+            if self._hold_apart(near, walls, moved):  # it goes on from here, by steps that know the walls
+                self._posture, self._posture_rows, self._is_near = self._path, None, True
+                return
+        self._path = self._posture if fraction <= 1 else self._path + moved
+
+    def _walls(self, qpos: np.ndarray, steps: int = 1) -> tuple[Near | None, Any]:
+        """Links near each other in a posture, and how far a step of a tick may change their distances."""
+        near = None if self._contacts is None else self._contacts.near(qpos)
+        if near is None:
+            return None, None
+        bounds = np.minimum(-self.period / _SLOWING * near.room, _RETREAT * self.period) / steps
+        return near, (near.gradient, bounds)
+
+    def _hold_apart(self, near: Near | None, walls: Any, moved: np.ndarray) -> bool:
+        """Notes whether a step is at a wall, or beyond."""
+        is_held = near is not None and bool(np.any(walls[0] @ moved <= walls[1] + _AT_WALL))
+        if self._contacts is not None and near is not None and is_held:
+            self._held_apart = self._contacts.names(near)
+        return is_held
 
     def _search(self, goal: Goal) -> None:
         """Searches other branches at the start of an approach, and while the hand is not reached, in each tick."""
@@ -272,8 +304,9 @@ class Teleoperator:
             if not self._is_near and self._is_chosen:
                 return  # on its way
             now = self._posture, lambda: self._goal
-            ahead = lambda: self._samples.last, self._goal_of
-            self._searched = self._branches.search(*now) if self._is_near else self._branches.search_ahead(*now, *ahead)
+            search, ahead = self._branches, lambda way, angle: self._goal_of(way(self._samples.last, angle))
+            ways = [functools.partial(ahead, way) for way in self._leads.ways]
+            self._searched = search.search(*now) if self._is_near else search.search_ahead(*now, ways)
         found = None
         for _ in range(self._steps):
             found = found or next(self._searched)
@@ -287,7 +320,8 @@ class Teleoperator:
         """Whether another branch is better, and the hand does not go away from its goal on the straight way there."""
         line = self._posture + np.linspace(0, 1, _LINE)[:, None] * (posture - self._posture)
         costs = self._pose.cost(goal, self._rows[1](line))
-        return cost < 0.5 * costs[0] and costs.max() <= _DETOUR * costs[0]
+        is_better = cost < 0.5 * costs[0] and costs.max() <= _DETOUR * costs[0]
+        return is_better and not (self._contacts and self._contacts.touch(line[1:]).any())
 
     def _status(self, positions: Sequence[float], rotations: Sequence[float]) -> TeleoperationStatus:
         """What the follower does, and why, from errors [m, rad] of the hands of the posture and of the command."""
@@ -307,6 +341,7 @@ class Teleoperator:
         at_limit = (self._posture - self._lower < 1e-3) | (self._upper - self._posture < 1e-3)
         names = ", ".join(np.array(self.follower.joint_names)[at_limit])
         why = f"{names} at the limit" if names else "out of reach" if position > _TOLERANCE[0] else "rotation not free"
+        why = f"{self._held_apart} would touch" if self._held_apart else why
         why = f"{why}: the nearest hand is {1e3 * position:.0f} mm and {np.degrees(rotation):.0f} deg away"
         return TeleoperationStatus("nearest", why, *errors)
 
@@ -325,67 +360,6 @@ def follower_limits(follower: Embodiment, velocity: Any = None) -> JointLimits:
         )
     speeds = np.broadcast_to(speeds, follower.num_joints)
     return joint_limits(np.asarray(follower.joint_range, float), speeds, np.asarray(follower.torque_limit))
-
-
-class _Samples:
-    """Checks the leader's samples.
-
-    Attributes:
-      reason: why the last sample was ignored; empty where it was not.
-      age: time since the last sample that was accepted [s].
-      last: that sample [rad].
-    """
-
-    def __init__(self, leader: Embodiment, period: float):
-        self._joints, self._continuous, self._period = leader.num_joints, continuous_joints(leader), period
-        self.forget()
-
-    def forget(self) -> None:
-        """Takes the next sample wherever it is."""
-        self.reason, self.age, self._newest = "", 0.0, -np.inf
-        self.last: Any = None
-        self._jumped, self._agreeing, self._backwards = None, 0.0, 0.0
-
-    def accept(self, qpos: Any, time: float | None) -> np.ndarray | None:
-        """The sample [joints]; None where there is none, or it is ignored."""
-        self.age += self._period
-        self.reason = ""
-        if qpos is None:
-            return None
-        sample = np.array(qpos, float)  # a copy: drivers use their buffers again
-        if sample.shape != (self._joints,):
-            raise ValueError(f"leader_qpos: expected {self._joints} angles [rad], got shape {sample.shape}")
-        if not math.isfinite(sample.dot(sample)) or (time is not None and not math.isfinite(time)):
-            self.reason = "ignored a sample that is not finite"
-        elif time is not None and self._is_old(time):
-            self.reason = "ignored a sample that is not newer than the last one"
-        elif self._is_jump(sample):
-            self.reason = "ignored a sample that jumped"
-        else:
-            self.last, self.age, self._jumped = sample, 0.0, None
-            return sample
-        return None
-
-    def _is_old(self, time: float) -> bool:
-        if time == self._newest:
-            return True  # the same sample again, however long
-        self._backwards = self._backwards + self._period if time < self._newest else 0.0
-        if 0 < self._backwards <= _PATIENCE:
-            return True
-        self._newest, self._backwards = time, 0.0
-        return False
-
-    def _is_jump(self, sample: np.ndarray) -> bool:
-        reach = _MAX_SPEED * max(self.age, self._period)
-        if self.last is None:
-            return False
-        moved = sample - self.last
-        if moved.dot(moved) <= reach**2 or np.abs(wrap_angles(moved, self._continuous)).max() <= reach:
-            return False  # the norm is checked first because it is fast
-        before, self._jumped = self._jumped, sample
-        near = before is not None and np.abs(wrap_angles(sample - before, self._continuous)).max() <= reach
-        self._agreeing = self._agreeing + self._period if near else 0.0
-        return self._agreeing <= _PATIENCE
 
 
 class _Gripper:

@@ -85,8 +85,9 @@ class TeleoperationRecorder:
     def _data_set(self, task: str) -> Episodes:
         operator, steps = self.operator, [len(ticks) for ticks in self._episodes]
         leader, follower, period = operator.leader, operator.follower, operator.period
+        arms: list[ArmMotions] = []
         qpos = [np.array([*(tick.follower for tick in x), x[-1].command]) for x in self._episodes]
-        of_leader = [np.array([*(tick.leader for tick in x), x[-1].leader]) for x in self._episodes]
+        led_by = [np.array([*(tick.leader for tick in x), x[-1].leader]) for x in self._episodes]
         commands = _padded([np.array([tick.command for tick in x]) for x in self._episodes])
         openings = _padded([np.array([*(tick.openings for tick in x), x[-1].openings[::-1]]) for x in self._episodes])
         gripper: dict[str, Any] = {}
@@ -94,18 +95,15 @@ class TeleoperationRecorder:
             openings = np.where(np.isfinite(openings), openings, openings[np.isfinite(openings)][0])  # the first known
             gripper = {"gripper": openings[..., :1], "gripper_names": (GRIPPER,)}
             gripper["gripper_command"] = openings[:, :-1, 1:]
-        arms = [
-            ArmMotions(
-                arm.name, arm.joint_names, _padded(x), _padded([np.gradient(y, period, axis=0) for y in x]), **more
-            )
-            for arm, x, more in (
-                (follower, qpos, {"command": commands, "quantity": ANGLE, **gripper}),
-                (leader, of_leader, {}),
-            )
-        ]
-        task, count = task or f"drive {follower.name} by {leader.name}", len(steps)
+        more = {"command": commands, "quantity": ANGLE, **gripper}
+        for arm, x, of_arm in ((follower, qpos, more), (leader, led_by, {})):
+            if arm is not None:
+                speeds = _padded([np.gradient(y, period, axis=0) for y in x])
+                arms.append(ArmMotions(arm.name, arm.joint_names, _padded(x), speeds, **of_arm))
+        task, count = task or f"drive {follower.name} by {leader.name if leader else 'a hand'}", len(steps)
         provenance = {"written_by": f"{NAME} {VERSION}", "source": "teleoperation"}
-        return Episodes(period, task, arms[0], arms[1], steps, ["train"] * count, range(count), provenance)
+        of_leader = arms[1] if leader else None
+        return Episodes(period, task, arms[0], of_leader, steps, ["train"] * count, range(count), provenance)
 
 
 def _padded(episodes: list[np.ndarray]) -> np.ndarray:

@@ -5,7 +5,8 @@ from typing import Any
 
 import viser
 
-from mimic.viewer.captured import ClipPlayer, PointTracker
+from mimic.arms.link_match import hand_poses
+from mimic.viewer.captured import ClipPlayer, HandTracker, PointTracker
 from mimic.viewer.live_session import LiveSession
 
 _SCRUB_STEP = 0.01  # s
@@ -61,9 +62,9 @@ class ClipControls:
 
 
 class PointControls:
-    """Moves the expert of a session by points, and says whether they arrive."""
+    """Moves the expert of a session by points, or its hand by poses, and says whether they arrive."""
 
-    def __init__(self, session: LiveSession, tracker: PointTracker):
+    def __init__(self, session: LiveSession, tracker: PointTracker | HandTracker):
         self._session, self._tracker = session, tracker
         self._state = tracker.state
         self._since_update = 0.0
@@ -76,11 +77,16 @@ class PointControls:
 
     def advance(self, dt: float) -> None:
         """Moves the expert, and prints a line where the sender has stopped or started."""
-        pose, paused = self._tracker.advance(dt)
-        if pose is not None:
-            if paused:
-                self._session.seek()
-            self._session.show_pose(pose)
+        if isinstance(self._tracker, HandTracker):
+            goal = self._tracker.advance(dt, lambda: hand_poses(self._session.expert, self._session.pose)[0])
+            if goal is not None:
+                self._session.drag_hand(goal)
+        else:
+            pose, paused = self._tracker.advance(dt)
+            if pose is not None:
+                if paused:
+                    self._session.seek()
+                self._session.show_pose(pose)
         if self._tracker.state != self._state:
             self._state = self._tracker.state
             print(f"view: {self._state}", file=sys.stderr, flush=True)

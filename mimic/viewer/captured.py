@@ -5,7 +5,7 @@ import dataclasses
 import math
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -121,6 +121,46 @@ class Said:
             print(f"view: {line}", file=sys.stderr, flush=True)
 
 
+class HandTracker:
+    """Drags the hand of an arm as the hand moves whose poses arrive, from where both are after a pause."""
+
+    def __init__(self, listener: PointListener):
+        self._listener = listener
+        self._then: tuple[np.ndarray, np.ndarray] | None = None  # poses of both hands
+        self._paused = PAUSE  # s since the last pose
+
+    def advance(self, dt: float, arm_hand: Callable[[], Float[np.ndarray, "4 4"]]) -> np.ndarray | None:
+        """The goal [4, 4] of the arm's hand [m]; None where no pose has arrived. `arm_hand` gives where it is."""
+        self._paused += dt
+        sample = self._listener.take()
+        if sample is None or sample.hand is None:
+            return None
+        if self._then is None or self._paused >= PAUSE:
+            self._then = sample.hand.pose, arm_hand()
+        self._paused, (then, start) = 0.0, self._then
+        goal = start.copy()
+        goal[:3, 3] += sample.hand.pose[:3, 3] - then[:3, 3]
+        goal[:3, :3] = sample.hand.pose[:3, :3] @ then[:3, :3].T @ start[:3, :3]
+        return goal
+
+    @property
+    def state(self) -> str:
+        """Whether poses arrive, as a phrase."""
+        return _state(self._listener, "poses of a hand arrive")
+
+    @property
+    def summary(self) -> str:
+        """Numbers of samples, as a phrase."""
+        return f"{self._listener.counts.received} samples, bad lines: {self._listener.counts.bad}"
+
+
+def _state(listener: PointListener, arrives: str) -> str:
+    if listener.silence < SILENCE:
+        return arrives
+    cause = "the sender is silent" if listener.is_connected else "no sender is connected"
+    return f"{cause}, the arms hold their pose"
+
+
 class PointTracker:
     """Poses of an arm from the newest points of a listener.
 
@@ -155,11 +195,7 @@ class PointTracker:
     @property
     def state(self) -> str:
         """Whether points arrive, as a phrase."""
-        silence = self._listener.silence
-        if silence < SILENCE:
-            return "points arrive"
-        cause = "the sender is silent" if self._listener.is_connected else "no sender is connected"
-        return f"{cause}, the arms hold their pose"
+        return _state(self._listener, "points arrive")
 
     @property
     def summary(self) -> str:

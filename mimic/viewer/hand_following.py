@@ -17,6 +17,7 @@ from mimic.metric.config import MetricConfig
 from mimic.retargeting.live_pose import ArmRows, LivePose
 from mimic.retargeting.teleoperation import HANDS as FOLLOWED
 from mimic.retargeting.teleoperation import TeleoperationStatus, Teleoperator
+from mimic.retargeting.teleoperation_recording import TeleoperationRecorder
 
 FREE = "free"
 HANDS = (FREE, *FOLLOWED)
@@ -71,10 +72,20 @@ class HandFrame(NamedTuple):
 
 
 class HandFollower:
-    """Moves the learner of an environment by a teleoperator, within the limits of its model."""
+    """Moves the learner of an environment by a teleoperator, within the limits of its model.
 
-    def __init__(self, expert: Embodiment, env: EnvConfig):
-        self._expert, self._env = expert, env
+    Args:
+      expert: the arm that leads.
+      env: environment that defines the learner.
+      is_recorded: whether what is driven is kept.
+
+    Attributes:
+      recorders: of what was driven, one for each teleoperator.
+    """
+
+    def __init__(self, expert: Embodiment, env: EnvConfig, is_recorded: bool = False):
+        self._expert, self._env, self._is_recorded = expert, env, is_recorded
+        self.recorders: list[TeleoperationRecorder] = []
         self._teleoperator: Teleoperator | None = None
         self._made_of: Any = None  # what the teleoperator is made of
         self._is_engaged, self._left = False, 0.0
@@ -113,8 +124,9 @@ class HandFollower:
             self._is_engaged = settings.is_engaged
         ticks = max(int(self._left + dt * _RATE), 1)
         self._left = max(self._left + dt * _RATE - ticks, 0.0)
+        drive = self.recorders[-1].step if self._is_recorded else operator.step
         for _ in range(ticks):
-            command = operator.step(expert_qpos)
+            command = drive(expert_qpos)
         goal = operator.goal or (np.zeros((0, 3)), np.zeros((0, 3, 3)))
         return command.qpos, HandFrame(*goal, command.status)
 
@@ -127,6 +139,8 @@ class HandFollower:
             rate=_RATE, velocity=finite_velocity_limit(arm), metric=self._env.metric,
         )  # fmt: skip
         operator.reset(np.clip(qpos, *operator.limits.position.T))
+        if self._is_recorded:
+            self.recorders.append(TeleoperationRecorder(operator))
         return operator
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from mimic.arms.arm import build_arm, finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import EnvConfig
+from mimic.retargeting.teleoperation_recording import TeleoperationRecorder
 from mimic.viewer.hand_following import FREE, HandDrag, HandFollower, HandFrame, HandSettings
 from mimic.viewer.tracking import (
     CompiledFunctions,
@@ -73,6 +74,7 @@ class LiveSession:
       any_arm: functions of a pose mapper to any arm; with these, the learner can be changed, and a joint is locked
         where it is instead of at its angle in the start pose.
       hand: how the learner's hand follows, at the start.
+      is_recorded: whether what the hand drives is kept.
 
     Attributes:
       expert: embodiment of the expert.
@@ -91,6 +93,7 @@ class LiveSession:
         mapper: Mapper | None = None,
         any_arm: FunctionSource | None = None,
         hand: HandSettings | None = None,
+        is_recorded: bool = False,
     ):
         self.hand: HandSettings = hand or HandSettings()
         self.expert: Embodiment = build_arm(env.expert, env.limits, env.metric.links).embodiment
@@ -107,7 +110,7 @@ class LiveSession:
         self._goal: np.ndarray | None = None  # pose of the learner to move to instead of the optimiser's
         self._seeks = False  # whether the learner is on its way to the best pose while the expert moves
         self._solved: tuple[Any, np.ndarray, float] | None = None  # request, best pose and bound
-        self._drag, self._follower = HandDrag(self.expert), HandFollower(self.expert, env)
+        self._drag, self._follower = HandDrag(self.expert), HandFollower(self.expert, env, is_recorded)
         self._active = self.settings  # the last settings with compiled functions
         self._rest_key: Any = None  # request for which the learner is at rest
 
@@ -212,6 +215,11 @@ class LiveSession:
     def finish(self) -> None:
         """Waits for a running compilation."""
         self._functions.finish()
+
+    @property
+    def driven(self) -> list[TeleoperationRecorder]:
+        """What the hand drove, a recorder for each of the settings."""
+        return [recorder for recorder in self._follower.recorders if recorder.episodes]
 
     def advance(self, dt: float) -> Frame | None:
         """Advances the view by a time step [s].

@@ -17,8 +17,9 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands import view, view_capture, view_server
 from mimic.commands.capture import fixed_fraction
 from mimic.commands.config import ViewConfig
-from mimic.commands.view_capture import listen, wait_for_arm
+from mimic.commands.view_capture import hand_expert, listen, wait_for_arm
 from mimic.envs import env_config
+from mimic.motions.mocap.live_hand import LiveHand
 from mimic.motions.mocap.live_points import Sample, sample_line
 from mimic.runs.signals import Signals
 from tests.helpers.bodies import bvh_text, person
@@ -38,7 +39,7 @@ from tests.helpers.bodies import bvh_text, person
         (["mapper=any_arm", "learners=[panda,panda]"], "learners: expected arms of different names, got panda, panda"),
         (["mapper=any_arm", "learners=[bimanual]"], "expected a serial arm, got a tree of 2 chains"),
         (["hand=near"], "hand: expected one of free, exact, relative, got 'near'"),
-        (["hand=exact", "mapper=any_arm"], "hand: expected free with run= or mapper=, which move the learner"),
+        (["hand=exact", "mapper=any_arm"], "hand: expected none with run= or mapper=, which move the"),
         (["base=[0,0,0,1]"], "base: expected same or [x,y,z,yaw] with hand=exact or relative"),
         (["demonstrations=a.npz", "run=b"], "demonstrations: expected none with run="),
         (["demonstrations=missing.npz"], "missing.npz"),
@@ -160,13 +161,22 @@ def test_the_arm_of_live_points_is_measured(sends):
     with contextlib.closing(listen(config)) as listener:
         sends(listener.port)
         measured = wait_for_arm(listener, config, config.env)
-    assert measured is not None
+    assert measured is not None and not isinstance(measured, LiveHand)
     arm, links = measured
     assert links.names == ("trunk", "upper_arm", "forearm", "hand") and arm.zero is not None
     np.testing.assert_allclose(links.link_lengths[1:], [0.28, 0.25, 0.09], atol=1e-9)
     # As large a part of the chain as the Panda's column, as for demonstrations.
     learner = build_arm(config.env.learner, config.env.limits, config.env.metric.links).embodiment
     assert links.link_lengths[0] / links.chain_length == pytest.approx(fixed_fraction(learner))
+
+
+def test_poses_of_a_hand_move_the_expert_s():
+    config = ViewConfig(env=env_config("panda4dof"), source=f"tcp://localhost:{free_port()}")
+    with contextlib.closing(listen(config)) as listener, socket.create_connection(("localhost", listener.port)) as out:
+        out.sendall(b'{"time": 0, "hand": {"position": [0, 0, 1], "wxyz": [1, 0, 0, 0]}, "gripper": 0.2}\n')
+        hand = wait_for_arm(listener, config, config.env)
+        assert isinstance(hand, LiveHand) and hand.gripper == 0.2
+        assert hand_expert(config.env, listener).env is config.env
 
 
 def test_points_in_another_unit_are_said_and_not_taken(sends, capsys, monkeypatch):

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.control.clearance import clearance
+from mimic.metric.capsule_distances import clearance_constants
 from mimic.retargeting.hand_target import matched_hands
 from mimic.retargeting.live_pose import FAR, ArmRows, LivePose
+from mimic.retargeting.self_contacts import APART, SelfContacts
 from mimic.retargeting.teleoperation import follower_limits
 from tests.helpers import original_model
 
@@ -233,3 +236,90 @@ def test_flipped_wrists_keep_the_rotation_of_the_hand(arms, tmp_path):
     assert len(flipped) > 1 and np.all(np.abs(np.diff(flipped, axis=0)).max(axis=1) > 1)
     axes = rows(flipped)[:, rows.hand_rows(np.array([0]))[1:]]
     np.testing.assert_allclose(axes, np.tile(axes[:1], (len(axes), 1, 1)), atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def capsules():
+    return mimic.fit_capsules(mimic.ArmConfig(), "hardware")
+
+
+def test_distances_of_links_are_those_of_the_safety_layer(arms, capsules):
+    """MuJoCo's distances, and their gradients, beside NumPy's of the safety layer."""
+    panda, contacts = arms[0], SelfContacts(arms[0], capsules)
+    constants = clearance_constants(panda, capsules, floor_height=-10.0)
+    apart, differences, gradients = APART * float(panda.chain_length), [], []
+    for qpos in np.random.default_rng(0).uniform(*panda.joint_range.T, (300, 7)):
+        near, smallest = contacts.near(qpos), float(clearance(qpos, constants))
+        if near is None:
+            assert smallest > 0.05
+            continue
+        np.testing.assert_allclose(near.room.min() + apart, smallest, atol=1e-5)  # of single precision
+        if smallest > 0.005:  # where axes cross, the distance has a kink
+            changes = clearance(qpos + 1e-3 * np.concatenate([np.eye(7), -np.eye(7)]), constants)
+            differences.append((changes[:7] - changes[7:]) / 2e-3)
+            gradients.append(near.gradient[near.room.argmin()])
+    # At a few poses another pair is the nearest within the difference.
+    assert len(gradients) > 20 and np.median(np.abs(np.subtract(gradients, differences)).max(axis=1)) < 2e-3
+
+
+@pytest.mark.parametrize("are_kept_apart", [False, True])
+def test_a_hand_that_is_led_into_the_arm_stops_before(arms, capsules, are_kept_apart):
+    """A pose of a hand leads, which needs no arm; the safety layer's distance of links is the judge."""
+    panda = arms[0]
+    operator = mimic.Teleoperator(None, panda, rate=RATE, capsules=capsules if are_kept_apart else None)
+    operator.engage()
+    pose = np.eye(4)
+    pose[:3, :3], begin = np.diag([1.0, -1.0, -1.0]), np.array([0.45, 0.1, 0.4])
+    samples = np.tile(pose, (400, 1, 1))
+    samples[:, :3, 3] = begin + np.linspace(0, 1, 400)[:, None] * ([0.0, 0.0, 0.25] - begin)
+    commands, path = drive(
+        operator, [*np.tile(samples[:1], (300, 1, 1)), *samples, *np.tile(samples[-1:], (600, 1, 1))]
+    )
+    assert_within_limits(operator, path)
+    assert commands[300].status.state == "tracking"
+    smallest = clearance(path, clearance_constants(panda, capsules, floor_height=-10.0)).min()
+    if are_kept_apart:
+        assert smallest > 0.005 and "would touch" in commands[-1].status.reason
+        assert (
+            commands[-1].status.state == "nearest" and np.abs(np.diff(path[-20:], axis=0)).max() < 2e-3
+        )  # it may slide
+    else:
+        assert smallest < -0.01
+
+
+def test_a_hand_leads_as_an_arm_does(arms):
+    """Relative poses move the follower's hand as far, whatever the headset's axes; bad ones are ignored."""
+    operator = mimic.Teleoperator(None, arms[0], hand="relative", rate=RATE)
+    start = mimic.hand_frames(arms[0], operator.qpos)
+    operator.engage()
+    pose = np.eye(4)
+    samples = [pose + [[0, 0, 0, x], [0, 0, 0, -x], [0] * 4, [0] * 4] for x in np.linspace(0, 0.1, 100)]
+    bad = [np.full((4, 4), np.nan), 2 * pose, pose + 3 * np.eye(4)[3], samples[-1] * [[1, 1, 1, 30]]]
+    commands, path = drive(operator, [*samples, *[samples[-1]] * 100, *bad])
+    assert_within_limits(operator, path)
+    moved = mimic.hand_frames(arms[0], path[-1])
+    np.testing.assert_allclose(moved.position - start.position, [[0.1, -0.1, 0]], atol=2e-4)
+    np.testing.assert_allclose(moved.rotation, start.rotation, atol=2e-3)
+    assert commands[199].status.state == "tracking"
+    assert ["not finite" in x.status.reason for x in commands[-4:]] == [True, True, False, False]
+    assert all("jumped" in x.status.reason for x in commands[-2:])
+    assert commands[-1].status.position_mm < 1
+    with pytest.raises(ValueError, match=r"expected 1 poses \[4, 4\]"):
+        operator.step(np.zeros(7))
+
+
+def test_the_branch_that_can_follow_is_taken():
+    """Of two elbows with the same hand, the nearer to the leader's soon ends at a limit."""
+    lengths, pose = (0.4, 0.4, 0.2), np.array([-0.4, 0.9, 0.0])
+    leader, follower = (
+        dataclasses.replace(mimic.planar_arm(lengths), velocity_limit=np.full(3, 2.0), home=np.zeros(3)) for _ in "ab"
+    )
+    ranges = np.array([[-2.5, 2.5], [-2.5, 1.0], [-2.5, 2.5]])  # 0.1 rad from the leader's elbow
+    follower = dataclasses.replace(follower, joint_range=ranges)
+    operator = mimic.Teleoperator(leader, follower, rate=RATE)
+    operator.engage()
+    drive(operator, [pose] * 500)
+    assert operator.qpos[1] < -0.5
+    elbow = np.linspace(0.9, 1.8, 300)[:, None]
+    commands, _ = drive(operator, [*(pose * [1, 0, 1] + elbow * [0, 1, 0]), *[[-0.4, 1.8, 0.0]] * 50])
+    assert {command.status.state for command in commands} <= {"tracking", "catching up"}

@@ -1,6 +1,7 @@
 """Captured motions that move a live view: the player of a clip, and the tracker of points."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ import pytest
 from mimic.motions.mocap.arms import find_arms
 from mimic.motions.mocap.ball_chain import zero_frames
 from mimic.motions.mocap.link_motion import arm_motion
+from mimic.motions.mocap.live_hand import LiveHand
 from mimic.motions.mocap.live_points import LiveArm, Sample, live_body
 from mimic.motions.mocap.point_socket import Counts
-from mimic.viewer.captured import Clip, ClipPlayer, PointTracker, Said, make_clip
+from mimic.viewer.captured import Clip, ClipPlayer, HandTracker, PointTracker, Said, make_clip
 from tests.helpers.bodies import RATE, person
 
 
@@ -98,6 +100,21 @@ def test_a_tracker_holds_its_pose_where_points_are_missing_or_wrong(capsys):
     assert capsys.readouterr().err.splitlines() == [
         "view: points: expected those of a link apart; the arms hold their pose"
     ]
+
+
+def test_a_hand_drags_the_arm_s_from_where_both_are():
+    """Poses after a pause move nothing at first, as the hand may then be anywhere."""
+    turned, arm_hand = np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])
+    turned[:3, :3], turned[:3, 3], arm_hand[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.1, 0, 0.2], [0.5, 0, 0.4]
+    samples = [Sample(t, {}, LiveHand(pose, None)) for t, pose in enumerate([np.eye(4), turned, turned])]
+    tracker = HandTracker(Listener([*samples[:2], Sample(2.0, {}), samples[2]]))  # type: ignore[arg-type]
+    goals: list[Any] = [tracker.advance(dt, lambda: arm_hand) for dt in (0.1, 0.1, 2.0, 0.1)]
+    np.testing.assert_allclose(goals[0], arm_hand)
+    expected = np.array([[0, 1, 0, 0.6], [1, 0, 0, 0], [0, 0, -1, 0.6], [0, 0, 0, 1]])
+    np.testing.assert_allclose(goals[1], expected, atol=1e-12)
+    assert goals[2] is None
+    np.testing.assert_allclose(goals[3], arm_hand)
+    assert tracker.state == "poses of a hand arrive"
 
 
 def test_a_kind_of_fault_is_said_once(capsys):

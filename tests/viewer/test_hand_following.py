@@ -10,9 +10,13 @@ import pytest
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.link_match import hand_poses
+from mimic.commands import view
+from mimic.commands.config import ViewConfig
 from mimic.envs import env_config
+from mimic.motions.formats.lerobot_reading import read_lerobot
 from mimic.retargeting.teleoperation import TeleoperationStatus
 from mimic.viewer.hand_following import HandDrag, HandFollower, HandFrame, HandSettings
+from mimic.viewer.live_session import LiveSession
 from tests.helpers import original_model
 
 TICK = 1 / 30
@@ -70,6 +74,22 @@ def test_a_clutch_takes_up_the_motion_where_it_is(panda, env):
     np.testing.assert_allclose(of_learner, 0.5 * of_expert, atol=1e-3)
 
 
+def test_what_is_driven_is_a_data_set(panda, env, tmp_path, capsys):
+    """Each closing of the clutch begins an episode, and another place of the base another data set."""
+    pytest.importorskip("pyarrow", reason="needs pyarrow")
+    session = LiveSession(env, hand=HandSettings("relative"), is_recorded=True)
+    follower, learner = session._follower, np.array([0.3, -1.2, 1.4, -1.0, -1.2, 0.2])
+    for settings in ({"is_engaged": True}, {"is_engaged": False}, {"is_engaged": True}, {"base": (0.1, 0, 0, 0)}):
+        learner, _ = run(follower, HandSettings("relative", **settings), learner, HOME, 0.2)
+    config = ViewConfig(env=env, record=str(tmp_path / "driven"))
+    view._finish(config, session)
+    assert f"2 episodes in {tmp_path}/driven\nview: 1 episodes in {tmp_path}/driven-1\n" in capsys.readouterr().out
+    motions = read_lerobot(tmp_path / "driven-1", build_arm(env.learner).embodiment.joint_names, "action").motions
+    np.testing.assert_allclose(next(iter(motions.values())).qpos[-1], learner, atol=1e-6)
+    view._finish(config, LiveSession(env, is_recorded=True))
+    assert "nothing was driven" in capsys.readouterr().out
+
+
 def test_what_is_out_of_reach_says_so(panda, env):
     qpos, frame = run(HandFollower(panda, env), HandSettings("exact", base=(3.0, 0, 0, 0)), np.zeros(6), HOME, 3.0)
     assert frame.status.state == "nearest" and frame.status.position_mm > 1000
@@ -107,9 +127,8 @@ def test_a_dragged_hand_goes_there_within_the_limits(panda):
 @pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-arms[view]'")
 def test_the_page_has_a_handle_a_tab_and_goals(env):
     from mimic.commands import view_server
-    from mimic.commands.config import ViewConfig
     from mimic.viewer.hand_controls import HandControls
-    from mimic.viewer.live_session import Frame, LiveSession
+    from mimic.viewer.live_session import Frame
     from mimic.viewer.manual_controls import ManualControls
 
     with socket.socket() as probe:

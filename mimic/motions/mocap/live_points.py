@@ -1,7 +1,7 @@
-"""Points of a person that arrive one sample at a time, and the pose of an arm in each.
+"""Points of a person, or a hand, that arrive one sample at a time, and the pose of an arm in each.
 
 A sample is a line of JSON: {"time": 12.34, "points": {"LeftArm": [0.1, 0.2, 1.4], ...}}, in seconds and metres, z up. A
-point that is not seen is null or left out.
+point that is not seen is null or left out. For a hand see `live_hand`.
 """
 
 import dataclasses
@@ -18,6 +18,7 @@ from mimic.motions.mocap.ball_chain import ball_chain_pose
 from mimic.motions.mocap.clips import turn_matrix, turned
 from mimic.motions.mocap.conventions import UNITS, arm_length, find_up, guessed_units, z_up
 from mimic.motions.mocap.link_motion import LinkMotion, arm_motion, link_ends_from_shoulder
+from mimic.motions.mocap.live_hand import LiveHand, is_number, parse_hand
 from mimic.motions.mocap.points import ArmPoints, PointMotion
 from mimic.motions.mocap.reading import one_person, with_arm
 
@@ -31,10 +32,11 @@ _CHANGED = 0.3  # of a link's length
 
 
 class Sample(NamedTuple):
-    """Positions of points at one time [s]; NaN where a point was not seen."""
+    """Positions of points at one time [s], NaN where a point was not seen; or a hand, None without one."""
 
     time: float
     points: Mapping[str, Float[np.ndarray, "3"]]
+    hand: LiveHand | None = None
 
 
 def parse_sample(line: bytes) -> Sample:
@@ -47,32 +49,28 @@ def parse_sample(line: bytes) -> Sample:
         content = json.loads(line)
     except (ValueError, RecursionError) as error:
         raise ValueError("expected a line of JSON") from error
-    if not isinstance(content, dict) or not isinstance(content.get("points"), dict):
-        raise ValueError("expected an object with 'time' and 'points'")
+    if not isinstance(content, dict) or not isinstance(content.get("points", content.get("hand")), dict):
+        raise ValueError("expected an object with 'time' and 'points' or 'hand'")
     time: Any = content.get("time")
-    points = content["points"]
-    if not _is_number(time) or not math.isfinite(time):
+    points = content.get("points", {})
+    if not is_number(time) or not math.isfinite(time):
         raise ValueError("time: expected a finite number of seconds")
     if len(points) > MAX_POINTS or any(len(name) > _MAX_NAME for name in points):
         raise ValueError(f"points: expected at most {MAX_POINTS}, with names of at most {_MAX_NAME} characters")
     positions = np.array([_position(name, point) for name, point in points.items()], float).reshape(-1, 3)
-    return Sample(float(time), dict(zip(points, positions, strict=True)))
+    hand = parse_hand(content) if "hand" in content else None
+    return Sample(float(time), dict(zip(points, positions, strict=True)), hand)
 
 
 def _position(name: str, point: Any) -> tuple[float, float, float]:
     if point is None:
         return _UNSEEN
-    if not isinstance(point, list) or len(point) != 3 or not all(map(_is_number, point)):
+    if not isinstance(point, list) or len(point) != 3 or not all(map(is_number, point)):
         raise ValueError(f"points: expected three numbers or null for {name!r:.60}")
     x, y, z = point
     if max(abs(x), abs(y), abs(z)) > _MAX_VALUE:
         raise ValueError(f"points: expected coordinates of at most {_MAX_VALUE:g} for {name!r:.60}")
     return x, y, z
-
-
-def _is_number(value: Any) -> bool:
-    """Whether a value of JSON is a number that NumPy can hold; true and false are none."""
-    return type(value) is float or (type(value) is int and abs(value) < 2**63)
 
 
 def sample_line(sample: Sample) -> bytes:

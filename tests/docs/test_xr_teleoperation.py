@@ -1,0 +1,92 @@
+"""Poses of a hand as WebXR and OpenXR give them, and the example that drives an arm by them."""
+
+import contextlib
+import json
+import socket
+import sys
+import time
+
+import mujoco
+import numpy as np
+import pytest
+
+import mimic
+from mimic.motions.mocap.live_points import parse_sample
+from mimic.motions.mocap.point_socket import PointListener
+from tests.helpers.repository import REPOSITORY
+
+sys.path.append(str(REPOSITORY / "examples"))
+
+import xr_teleoperation  # noqa: E402  # pyright: ignore[reportMissingImports]
+
+FORWARD = [1.0, 0.0, 0.0, 0.0]  # a controller of which -z, its ray, points forward
+
+
+def hand_of(*arguments, **more):
+    hand = parse_sample(line(*arguments, **more)).hand
+    assert hand is not None
+    return hand
+
+
+def line(position, wxyz=FORWARD, **more):
+    return json.dumps({"time": 0.1, "hand": {"position": list(position), "wxyz": list(wxyz)}, **more}).encode()
+
+
+def test_axes_of_a_headset():
+    """A hand 1.2 m up, 0.3 m ahead and 0.1 m to the right, that points forward and opens sideways."""
+    pose = hand_of([0.1, 1.2, -0.3], frame="xr").pose
+    np.testing.assert_allclose(pose[:3, 3], [0.3, -0.1, 1.2])
+    np.testing.assert_allclose(pose[:3, 2], [1, 0, 0], atol=1e-12)  # approach: forward
+    np.testing.assert_allclose(pose[:3, 0], [0, -1, 0], atol=1e-12)  # opening: to the right
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+    half = np.sqrt(0.5)  # raised by 90 degrees about x, which points right
+    raised = hand_of([0, 0, 0], [half, half, 0, 0], frame="xr").pose
+    np.testing.assert_allclose(raised[:3, 2], [0, 0, 1], atol=1e-12)
+
+
+def test_quaternions_are_mujoco_s():
+    wxyz, matrix = np.array([0.5, -0.1, 0.7, 0.5]), np.zeros(9)
+    wxyz /= np.linalg.norm(wxyz)
+    mujoco.mju_quat2Mat(matrix, wxyz)
+    hand = hand_of([1, 2, 3], wxyz, gripper=0.25)
+    np.testing.assert_allclose(hand.pose[:3], np.column_stack([matrix.reshape(3, 3), [1, 2, 3]]), atol=1e-12)
+    assert hand.gripper == 0.25
+
+
+@pytest.mark.parametrize(("bad", "message"), [
+    (line([0, 1]), "position"),
+    (line([0, 0, float("nan")]), "position"),
+    (line([0, 0, 0], [0, 0, 0, 0]), "length 1, got 0"),
+    (line([0, 0, 0], frame="y_up"), "frame: expected one of xr, mimic, got 'y_up'"),
+    (line([0, 0, 0], gripper="open"), "gripper: expected a finite number"),
+    (b'{"time": 0, "hand": 3}', "'points' or 'hand'"),
+])  # fmt: skip
+def test_what_is_no_hand_says_why(bad, message):
+    with pytest.raises(ValueError, match=message):
+        parse_sample(bad)
+
+
+def test_a_headset_drives_an_arm():
+    """Forward and right in the headset's space are forward and right of the arm; a gap opens the clutch."""
+    pytest.importorskip("ruckig", reason="needs ruckig")
+    panda, commands = mimic.panda(limits="hardware"), []
+    operator = mimic.TeleoperationRecorder(mimic.Teleoperator(None, panda, hand="relative", rate=100.0))
+    start = mimic.hand_frames(panda, operator.operator.qpos)
+    with contextlib.closing(PointListener("localhost", 0)) as listener:
+        with socket.create_connection(("localhost", listener.port)) as headset:
+            for tick in range(40):
+                moved = min(tick / 30, 1)
+                content = {"position": [0.05 * moved, 1.2, -0.1 * moved], "wxyz": FORWARD}
+                sample = {"time": 0.01 * tick, "hand": content, "frame": "xr", "gripper": 0.5}
+                headset.sendall(json.dumps(sample).encode() + b"\n")
+                while listener.counts.received <= tick:
+                    time.sleep(1e-3)
+                xr_teleoperation.drive(listener, operator, commands.append)
+        for _ in range(100):  # no further sample: it catches up
+            commands.append(operator.step(None))
+        moved = mimic.hand_frames(panda, commands[-1].qpos).position - start.position
+        np.testing.assert_allclose(moved, [[0.1, -0.05, 0]], atol=1e-3)
+        assert commands[-1].gripper == 0.5 and operator.episodes == 1
+        listener._arrived = -1e3
+        xr_teleoperation.drive(listener, operator, commands.append)
+        assert commands[-1].status.state == "disengaged"
