@@ -243,7 +243,8 @@ def _layout(file: Path, episode: Episode) -> _Layout | None:
         return None
     text = _text(episode.group.attrs[MODEL])
     if not text.lstrip().startswith("<"):
-        text = read_text(file.parent / Path(text).name)  # beside the file: robosuite 1.0
+        places = [folder / Path(text).name for folder in (file.parent, file.parent / "models")]  # of robosuite 1.0
+        text = read_text(next(filter(Path.is_file, places), places[0]))
     if "<!" in text.replace("<!--", ""):
         raise ValueError("the model declares a document type, expected elements alone")
     root = ElementTree.fromstring(text)

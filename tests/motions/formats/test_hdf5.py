@@ -87,8 +87,10 @@ def test_states_are_read_in_the_order_of_the_model(tmp_path):
             np.testing.assert_array_equal(values, expected)
 
 
-def test_a_model_may_lie_beside_the_file_and_a_folder_has_episodes(tmp_path):
-    (tmp_path / "model.xml").write_text(MODEL)
+@pytest.mark.parametrize("folder", [".", "models"])
+def test_a_model_may_lie_beside_the_file_and_a_folder_has_episodes(folder, tmp_path):
+    (tmp_path / folder).mkdir(exist_ok=True)
+    (tmp_path / folder / "model.xml").write_text(MODEL)
     for name in ("episode_0", "episode_1"):
         file = write(
             tmp_path / f"{name}.h5", {"demo_3/states": STATES}, {"demo_3": {"model_file": "/home/x/model.xml"}}
