@@ -59,6 +59,7 @@ from mimic.motions.units import in_rad
 from mimic.retargeting.hand_target import placement
 
 ARMS = "ur5e", "iiwa14", "gen3", "jaco", "xarm7"
+METHODS = "mimic", "ssik", "copied"
 TASKS = "lift", "stack", "nut-assembly", "pick-place", "door"
 PAIRS = "learner task frames exact mm:.3f deg:.3f speed:.2f margin_deg:.1f depth_mm:.1f gripper ok seconds:.0f"
 FAILING = "learner task first last frame postures speed:.2f"
@@ -271,59 +272,51 @@ def teleoperation(options: argparse.Namespace) -> Iterator[Row]:
         yield as_numbers(row)
 
 
-def other_methods(options: argparse.Namespace, expert: Model, row: Row) -> Iterator[tuple[str, np.ndarray]]:
-    """Joint angles of the Panda copied, and those of seeded inverse kinematics; the same base."""
-    path = Path(options.demonstrations) / row["task"] / "demo.hdf5"
-    with h5py.File(path) as file:
-        qpos = np.asarray(file[f"{_EPISODE}/states"], float)[:, 1:8]
-    arm = build_arm(ArmConfig(model=str(with_speeds(options.folder, row["learner"]))), "hardware").embodiment
-    lower, upper = arm.joint_range.T
-    yield "copied", np.clip(qpos[:, : arm.num_joints], lower, upper)
-    yield "ssik", followed_by_ssik(arm, targets(expert, qpos, row["base"]), np.asarray(arm.home, float))
-
-
-def in_physics(options: argparse.Namespace, expert: Model, rows: list[Row]) -> list[Row]:
-    """Task success of each pair and method, and of the Panda's own motions."""
-    work, jobs = Path(options.work).absolute(), []
-
-    def add(task: str, name: str, method: str, base: list[float], qpos: np.ndarray) -> None:
-        path, folder = work / f"{task}_{name}_{method}.npy", Path(options.demonstrations).absolute() / task
-        np.save(path, qpos)
-        frames = np.linspace(0, len(qpos) - 1, 4).round().astype(int).tolist()
-        job = {"task": task, "robot": name, "method": method, "base": base, "motion": str(path), "frames": frames}
-        jobs.append({**job, "demonstration": str(folder)})
-
-    for task in options.tasks:
-        with h5py.File(Path(options.demonstrations) / task / "demo.hdf5") as file:
-            add(task, "panda", "recorded", [0.0] * 4, np.asarray(file[f"{_EPISODE}/states"], float)[:, 1:8])
+def in_physics(options: argparse.Namespace, expert: Model, method: str, rows: list[Row]) -> list[Row]:
+    """Task success of an arm's motions by a method: the Panda's own, mimic's, copied joints or those of seeded ssik."""
+    work, jobs, name = Path(options.work).absolute(), [], rows[0]["learner"]
+    arm = build_arm(ArmConfig(model=str(with_speeds(options.folder, name))), "hardware").embodiment
     for row in rows:
-        add(row["task"], row["learner"], "mimic", row["base"], np.load(work / f"{row['task']}_{row['learner']}.npy"))
-        for method, qpos in other_methods(options, expert, row):
-            add(row["task"], row["learner"], method, row["base"], qpos)
-    (work / "jobs.json").write_text(json.dumps(jobs))
+        folder, path = (
+            Path(options.demonstrations).absolute() / row["task"],
+            work / f"{row['task']}_{name}_{method}.npy",
+        )
+        with h5py.File(folder / "demo.hdf5") as file:
+            qpos = np.asarray(file[f"{_EPISODE}/states"], float)[:, 1:8]
+        if method == "mimic":
+            qpos = np.load(work / f"{row['task']}_{name}.npy")
+        elif method == "ssik":
+            qpos = followed_by_ssik(arm, targets(expert, qpos, row["base"]), np.asarray(arm.home, float))
+        elif method == "copied":
+            qpos = np.clip(qpos[:, : arm.num_joints], *arm.joint_range.T)
+        np.save(path, qpos)
+        frames = [len(qpos) // 2, len(qpos) - 1] if method == "mimic" else []
+        job = {"task": row["task"], "robot": name, "method": method, "base": row["base"], "motion": str(path)}
+        jobs.append({**job, "frames": frames, "demonstration": str(folder)})
+    files = [work / f"{kind}_{name}_{method}.json" for kind in ("jobs", "replays")]
+    files[0].write_text(json.dumps(jobs))
     script = Path(__file__).with_name("robosuite_replay.py")
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    command = [options.physics, str(script), "replay", str(work / "jobs.json"), str(work / "replays.json")]
-    subprocess.run(command, check=True, env=environment)
+    subprocess.run([options.physics, str(script), "replay", *map(str, files)], check=True, env=environment)
     keys = "task", "method", "success", "ever", "objects", "tracking_error_rad"
-    results = json.loads((work / "replays.json").read_text())
+    results = json.loads(files[1].read_text())
     return [{"learner": result["robot"], **{key: result[key] for key in keys}} for result in results]
 
 
-def kept(options: argparse.Namespace, path: Path, measure: Callable[[], Row]) -> Row:
-    """A row from its file if that is of the same code, or measured and written there."""
+def kept(options: argparse.Namespace, path: Path, measure: Callable[[], Any]) -> Any:
+    """A row, or rows, from a file if that is of the same code, or measured and written there."""
     code = measured_code.hashes(options.benchmark)
-    if path.exists() and (row := json.loads(path.read_text())).pop("code") == code:
-        return row
-    row = measure()
-    write_atomically(path, json.dumps({**row, "code": code}))
-    return row
+    if path.exists() and (content := json.loads(path.read_text()))["code"] == code:
+        return content["rows"]
+    rows = measure()
+    write_atomically(path, json.dumps({"code": code, "rows": rows}))
+    return rows
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = make_parser(
         "transfer", __doc__, demonstrations="../shared/data/robosuite_demos", work="transfer", arms=ARMS, tasks=TASKS,
-        physics="", data="",
+        methods=METHODS, physics="", data="",
     )  # fmt: skip
     parser.add_argument("folder")
     options = parser.parse_args(arguments)
@@ -341,10 +334,16 @@ def main(arguments: list[str] | None = None) -> None:
         if "lift" in options.tasks and len(learner.range) == _WITHOUT_REDUNDANCY:
             measure = functools.partial(round_trip, options, expert, name)
             content["round_trip"].append(kept(options, Path(options.work) / f"round_trip_{name}.json", measure))
+    own = [{"learner": "panda", "task": task, "base": [0.0] * 4} for task in options.tasks]
+    for method in ("recorded", *options.methods) if options.physics else ():
+        for name in options.arms if method in METHODS else ("panda",):
+            rows = [row for row in own + content["pairs"] if row["learner"] == name]
+            measure = functools.partial(in_physics, options, expert, method, rows)
+            content["physics"] += kept(options, Path(options.work) / f"physics_{name}_{method}.json", measure)
+            write_results(options, **content)
     if options.data:
-        content["teleoperation"] = list(teleoperation(options))
-    if options.physics:
-        content["physics"] = in_physics(options, expert, content["pairs"])
+        path = Path(options.work) / "teleoperation.json"
+        content["teleoperation"] = kept(options, path, lambda: list(teleoperation(options)))
     write_results(options, **content)
     print_table(content["pairs"], PAIRS, "pairs")
     print_table(content["failing"], FAILING, "frames that fail")
