@@ -37,6 +37,20 @@ def drive(
     send(operator.step(pose, gripper, None if sample is None else sample.time))
 
 
+def follow_hand(arm: str, rate: float, velocity: float | None) -> mimic.TeleoperationRecorder:
+    """What a hand drives; its links are kept apart where its model has shapes."""
+    config, capsules = mimic.ArmConfig(model=arm), None
+    follower = mimic.build_arm(config, "hardware").embodiment
+    try:
+        capsules = mimic.fit_capsules(config, "hardware")
+    except ValueError as error:
+        print(f"links are not kept apart: {error}", flush=True)
+    operator = mimic.Teleoperator(
+        None, follower, hand="relative", rate=rate, velocity=velocity, capsules=capsules
+    )  # fmt: skip
+    return mimic.TeleoperationRecorder(operator)
+
+
 def main() -> None:
     """Drives until Ctrl-C."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -47,13 +61,10 @@ def main() -> None:
     parser.add_argument("--record", help="new folder for a LeRobot data set of what was driven")
     options = parser.parse_args()
 
-    config = mimic.ArmConfig(model=options.arm)
-    follower = mimic.build_arm(config, "hardware").embodiment
-    operator = mimic.Teleoperator(
-        None, follower, hand="relative", rate=options.rate, velocity=options.velocity,
-        capsules=mimic.fit_capsules(config, "hardware"),
-    )  # fmt: skip
-    recorder, state = mimic.TeleoperationRecorder(operator), ""
+    try:
+        recorder, state = follow_hand(options.arm, options.rate, options.velocity), ""
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
 
     def send(command: mimic.FollowerCommand) -> None:
         """The place of the robot's driver; here it prints what changes."""

@@ -39,6 +39,8 @@ _STUCK = 0.3  # s with a hand that is not reached, after which another branch is
 _LINE, _DETOUR = 16, 1.1  # points of a straight way to another branch; it may increase the hand's cost so much
 _SLOWING, _RETREAT = 0.1, 0.05  # s in which links that come near each other lose 63 % of the room; m/s apart, at most
 _AT_WALL = 1e-6  # m
+_BACKED = 4  # times that a step which goes too far is halved
+_LEAD, _CORNER = 1.0, 0.03  # ticks that the path leads the command, where links have less room [chain lengths]
 
 
 class TeleoperationStatus(NamedTuple):
@@ -250,6 +252,9 @@ class Teleoperator:
 
     def _advance(self, goal: Goal) -> None:
         """Moves the posture towards the goal, and the path towards the posture."""
+        if self._waits():
+            self._speed = 0 * self._speed
+            return
         reach, posture, rows, last = self._reach, self._posture[None], self._posture_rows, self._posture
         lower, upper = np.maximum(self._lower, last - reach), np.minimum(self._upper, last + reach)
         self._held_apart = ""
@@ -257,6 +262,8 @@ class Teleoperator:
             near, walls = self._walls(posture[0], self._steps)
             before, posture = posture, self._pose.step(goal, posture, lower, upper, NEAR, self._left, rows, walls)
             self._hold_apart(near, walls, posture[0] - before[0])
+            if near is not None:
+                posture = self._backed(before[0], posture[0], near)[None]
             rows = None
         self._posture, follows = posture[0], self._path is last
         moved = self._posture - last
@@ -278,6 +285,23 @@ class Teleoperator:
                 self._posture, self._posture_rows, self._is_near = self._path, None, True
                 return
         self._path = self._posture if fraction <= 1 else self._path + moved
+
+    def _backed(self, before: np.ndarray, after: np.ndarray, near: Near) -> np.ndarray:
+        """A step near walls, or a part of it that goes no deeper: walls may be curved."""
+        least = min(near.room.min(), 0.0) - _AT_WALL
+        for _ in range(_BACKED):
+            now = self._contacts and self._contacts.near(after)
+            if now is None or now.room.min() >= least:
+                return after
+            after = (before + after) / 2
+        return before
+
+    def _waits(self) -> bool:
+        """Whether the path waits for the command, which would cut a corner between links that are near each other."""
+        if self._contacts is None or np.all(np.abs(self._path - self._limiter.qpos) <= _LEAD * self._reach):
+            return False
+        near = [self._contacts.near(qpos) for qpos in (self._path, self._limiter.qpos)]
+        return any(x is not None and x.room.min() < _CORNER * self._rows[1].unit for x in near)
 
     def _walls(self, qpos: np.ndarray, steps: int = 1) -> tuple[Near | None, Any]:
         """Links near each other in a posture, and how far a step of a tick may change their distances."""

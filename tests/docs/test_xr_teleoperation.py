@@ -66,11 +66,12 @@ def test_what_is_no_hand_says_why(bad, message):
         parse_sample(bad)
 
 
-def test_a_headset_drives_an_arm():
+def test_a_headset_drives_an_arm(tmp_path):
     """Forward and right in the headset's space are forward and right of the arm; a gap opens the clutch."""
-    pytest.importorskip("ruckig", reason="needs ruckig")
+    for package in ("ruckig", "pyarrow"):
+        pytest.importorskip(package, reason=f"needs {package}")
     panda, commands = mimic.panda(limits="hardware"), []
-    operator = mimic.TeleoperationRecorder(mimic.Teleoperator(None, panda, hand="relative", rate=100.0))
+    operator = xr_teleoperation.follow_hand("panda", 100.0, None)
     start = mimic.hand_frames(panda, operator.operator.qpos)
     with contextlib.closing(PointListener("localhost", 0)) as listener:
         with socket.create_connection(("localhost", listener.port)) as headset:
@@ -90,3 +91,6 @@ def test_a_headset_drives_an_arm():
         listener._arrived = -1e3
         xr_teleoperation.drive(listener, operator, commands.append)
         assert commands[-1].status.state == "disengaged"
+    operator.write(tmp_path / "driven")  # of the follower alone, as a hand has no joints
+    info = json.loads((tmp_path / "driven/meta/info.json").read_text())
+    assert info["total_episodes"] == 1 and not any("expert" in name for name in info["features"])
