@@ -321,6 +321,7 @@ class Evaluator:
         of_one: dict[str, Any] = {}
         if self._arms is None:
             of_one = {"by_kind": self._by_kind(table), "effective_rank": self._effective_rank()}
+            of_one["late_gap"] = self._late_gap(rollouts)
         else:
             gaps_of_many = {"median_gap": by_split("gap", np.median), "largest_gap": by_split("gap", np.max)}
             gaps_of_many["controller_gap"] = by_split("controller_gap")
@@ -328,6 +329,14 @@ class Evaluator:
         others = [key for key in by_arm if key not in ("gap", "controller_gap", "span", *distances)]
         totals = {key: by_split(key) for key in others}
         return {"optimality_gap": by_split("gap"), **gaps_of_many, **distances, **of_one, **totals}
+
+    def _late_gap(self, rollouts: Rollouts) -> dict[str, float]:
+        """The gap of the second half of the episodes by split, in which the way from the start pose has ended."""
+        curves = np.asarray(rollouts.distance), self.lower_bound, self.hold_distance
+        late = slice(curves[0].shape[1] // 2, None)
+        return {
+            split: float(gaps(*(x[part, late].mean(dtype=float) for x in curves))) for split, part in self.parts.items()
+        }
 
     def _effective_rank(self) -> dict[str, float]:
         demonstrations = self.env.demonstrations

@@ -191,6 +191,19 @@ def test_a_report_explains_a_missing_gap(evaluator, monkeypatch):
     assert rows[2][0] == "mean distance" and float(rows[2][1]) > 0
 
 
+def test_a_report_shows_that_the_gap_is_that_of_the_first_half(evaluator):
+    """At the bound in the second half, and at twice the distance of holding before."""
+    distance = np.array(evaluator.lower_bound)
+    distance[:, : HORIZON // 2] = 2 * evaluator.hold_distance[:, : HORIZON // 2]
+    ran = rollouts(evaluator, distance=distance)
+    metrics = {**evaluator.summary(ran), "worst_demonstrations": evaluator.worst(ran), "energy_distance": {}}
+    assert metrics["late_gap"] == pytest.approx(dict.fromkeys(SPLITS, 0.0), abs=1e-9)
+    assert min(metrics["optimality_gap"].values()) > 0.1
+    assert ("  in the second half", "0.00%", "0.00%") in PPOTrainer.rows(object.__new__(PPOTrainer), metrics)
+    metrics["late_gap"] = metrics["optimality_gap"]
+    assert all("second half" not in row[0] for row in PPOTrainer.rows(object.__new__(PPOTrainer), metrics))
+
+
 def test_the_table_as_a_file(evaluator, tmp_path):
     ran = between(evaluator, np.linspace(0.1, 0.9, COUNT + HELD_OUT))
     evaluator.save_table(ran, tmp_path / "demonstrations.csv")

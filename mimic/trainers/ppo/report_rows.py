@@ -8,6 +8,7 @@ from mimic.evaluation.labels import ALL_KINDS, SPLITS
 from mimic.evaluation.rollout_metrics import MIN_SPAN
 from mimic.trainers.trainer import Metrics, Row
 
+_EARLY = 0.5  # fraction of the gap, below which that of the second half is shown: most is the way from the start pose
 _DISTANCES = (
     ("mean distance", "mean_distance", "{:.4f}"),
     ("  kinematic bound (gap 0)", "lower_bound", "{:.4f}"),
@@ -54,6 +55,9 @@ def rows(metrics: Metrics) -> list[Row]:
     if metrics["energy_distance"]:
         rows.insert(4, ("energy distance", *_texts("{:.4f}", metrics["energy_distance"])))
     rows[1:1] = _rows_of_kinds(metrics["by_kind"])
+    gap, late = metrics["optimality_gap"], metrics["late_gap"]
+    if any(late[split] < _EARLY * gap[split] for split in SPLITS):
+        rows.insert(1, ("  in the second half", *_texts("{:.2%}", late)))
     rows += [
         (f"reward term {key.removeprefix('reward.')}", *_texts("{:.4f}", value))
         for key, value in metrics.items()
