@@ -131,6 +131,8 @@ def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
             )
             if name == "ARGS":
                 check(["python", "-m", "mimic.train", *shlex.split(value)], monkeypatch)
+    elif words[:2] == ["pip", "download"]:
+        assert "--no-deps" in words, words
     elif program == "pip":
         assert words[:4] == ["pip", "install", "-c", "constraints.txt"] and words[4] == "-e", words
         extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["optional-dependencies"]
