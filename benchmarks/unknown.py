@@ -124,8 +124,8 @@ def missing_torque(env: HardwareEnv, draw: Draw, episode: HardwareState) -> Arra
 def estimated_angles(env: HardwareEnv) -> Array:
     """Angles [demonstrations, ticks, joints] of the expert that explain what the episodes of an evaluation measure.
 
-    Least squares of the visible positions and directions at each tick, near the angles of the tick before; then local
-    parabolas over time, in which a tick counts as much as it has visible links.
+    Least squares of the visible positions, directions and hands at each tick, near the angles of the tick before; then
+    local parabolas over time, in which a tick counts as much as it has visible links.
     """
     ticks = env.config.horizon + 1
 
@@ -134,10 +134,12 @@ def estimated_angles(env: HardwareEnv) -> Array:
 
         def residual(qpos: Array) -> Array:
             now = link_states(env.expert, qpos, jnp.zeros_like(qpos))
-            terms = [now.position - states.position]
+            terms = [visible[:, None] * (now.position - states.position)]
             if states.direction is not None and now.direction is not None:
-                terms.append(now.direction - states.direction)
-            return jnp.concatenate([(visible[:, None] * term).ravel() for term in terms])
+                terms.append(visible[:, None] * (now.direction - states.direction))
+            if states.hand is not None and now.hand is not None:  # of a roll, which no link shows
+                terms.append(visible[-1] * (now.hand.axes - states.hand.axes))
+            return jnp.concatenate([term.ravel() for term in terms])
 
         def improve(qpos: Array, _: None) -> tuple[Array, None]:
             slope, prior = jax.jacfwd(residual)(qpos), PRIOR * jnp.eye(len(qpos))
