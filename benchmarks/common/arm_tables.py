@@ -214,15 +214,15 @@ def captured_policies(results: Results) -> list[Cells]:
 
 def transfers(results: Results) -> list[Cells]:
     """Demonstrations on each arm: how many keep all hands, and how many succeed in robosuite by each method."""
-    rows: list[Cells] = [("arm", "exact in all frames", "frames", "succeed in robosuite", "ssik", "joints copied")]
+    titles = {"mimic": "succeed in robosuite", "ssik": "ssik", "copied": "joints copied"}
+    methods = [method for method in titles if where(results["physics"], method=method)]
+    rows: list[Cells] = [("arm", "exact in all frames", "frames", *(titles[method] for method in methods))]
     learners = list(dict.fromkeys(row["learner"] for row in results["pairs"]))
     for name in [learners, *([learner] for learner in learners)]:
         pairs = [row for row in results["pairs"] if row["learner"] in name]
         frames = sum(row["exact"] for row in pairs) / sum(row["frames"] for row in pairs)
         replays = [row for row in results["physics"] if row["learner"] in name]
-        succeed = [
-            sum(row["success"] for row in where(replays, method=method)) for method in ("mimic", "ssik", "copied")
-        ]
+        succeed = [sum(row["success"] for row in where(replays, method=method)) for method in methods]
         exact = sum(row["exact"] == row["frames"] for row in pairs)
         counts = [f"{count} of {len(pairs)}" for count in (exact, *succeed)]
         rows.append((name[0] if len(name) == 1 else "all", counts[0], percent(frames), *counts[1:]))
