@@ -4,8 +4,8 @@
 
 All methods compute the embodiment distance of joint positions and velocities in the default metric; "gradient" also
 its gradient with respect to the learner's motion, "all" to that of both arms. Batches are of the Panda with 7 joints
-and the one with 4; links are those of two planar arms. `mimic` is `motion_distance`, `composition` its parts called
-separately, `matrices` a straightforward JAX program on 4x4 matrices, `torch` the same in PyTorch, where it is
+and the one with 4; links are those of two planar arms. `mimic` is `motion_distance` of the links,
+"mimic, with hands" that of the default metric, `composition` the parts of the first called separately, `matrices` a straightforward JAX program on 4x4 matrices, `torch` the same in PyTorch, where it is
 installed. Limits of the device are the memory traffic of a copy, and the rate of fused multiply-adds.
 """
 
@@ -30,10 +30,12 @@ from mimic.metric.config import MetricConfig
 BATCHES = (1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8)
 LINKS = (3, 4, 7, 16, 32, 64)
 TORCH = ("torch", "torch.compile")
-METHODS = (*TORCH, "mimic", "composition", "matrices")  # PyTorch first: JAX keeps its memory
+HAND = "mimic, with hands"
+METHODS = (*TORCH, "mimic", HAND, "composition", "matrices")  # PyTorch first: JAX keeps its memory
 QUANTITIES = {"value": (), "gradient": (2, 3), "all": (0, 1, 2, 3)}  # arguments of the gradient
 METRIC = MetricConfig()
 WEIGHTS = cast(mimic.DistanceWeights, METRIC.make_weights())  # constants, in the default metric
+HANDS = mimic.HandWeights(METRIC.hand_rotation, METRIC.hand_position)
 LONGEST = 1.0  # s a call; the next case is about ten times as large
 CHECKED = 1000  # pairs that are compared with double precision
 COLUMNS = (
@@ -58,11 +60,14 @@ def planar_pair(links: int) -> Arms:
 def jax_function(method: str, arms: Arms, quantity: str) -> Callable[..., Any]:
     case = arms.expert, arms.learner, arms.correspondence, WEIGHTS
 
+    hands = {"hand_weights": HANDS} if "hands" in method else {}
+
     def composition(*motion: jax.Array) -> jax.Array:
         states = mimic.link_states(arms.expert, *motion[:2]), mimic.link_states(arms.learner, *motion[2:])
-        return mimic.embodiment_distance(*states, *case[2:])
+        return mimic.embodiment_distance(*states, *case[2:], **hands)
 
-    make = {"mimic": mimic.motion_distance, "matrices": kernel_peers.jax_distance}
+    with_hands = functools.partial(mimic.motion_distance, **hands)
+    make = {"mimic": mimic.motion_distance, HAND: with_hands, "matrices": kernel_peers.jax_distance}
     distance, by = make.get(method, lambda *_: composition)(*case), QUANTITIES[quantity]
     return jax.vmap(jax.value_and_grad(distance, by) if by else distance)
 
@@ -76,14 +81,15 @@ def random_motions(arms: Arms, batch: int) -> list[jax.Array]:
 
 
 @functools.cache
-def _compiled_reference(arms: Arms, quantity: str) -> Callable[..., Any]:
-    return jax.jit(jax_function("composition", arms, quantity))
+def _compiled_reference(method: str, arms: Arms, quantity: str) -> Callable[..., Any]:
+    return jax.jit(jax_function(method, arms, quantity))
 
 
-def reference(arms: Arms, motions: Sequence[jax.Array], quantity: str) -> Any:
+def reference(method: str, arms: Arms, motions: Sequence[jax.Array], quantity: str) -> Any:
     """Value and gradients of the first pairs in double precision, on the CPU."""
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
-        values = _compiled_reference(arms, quantity)(*(np.asarray(x[:CHECKED], np.float64) for x in motions))
+        name = "composition, with hands" if method == HAND else "composition"
+        values = _compiled_reference(name, arms, quantity)(*(np.asarray(x[:CHECKED], np.float64) for x in motions))
         return jax.tree.map(np.asarray, values)
 
 
@@ -114,7 +120,7 @@ def run(method: str, arms: Arms, batch: int, quantity: str) -> Row:
     else:
         timing = time_program(jax_function(method, arms, quantity), *motions)
         values = jax.tree.map(lambda x: np.asarray(x[:CHECKED]), timing.result)
-    pairs = zip(*map(jax.tree.leaves, (values, reference(arms, motions, quantity))), strict=True)
+    pairs = zip(*map(jax.tree.leaves, (values, reference(method, arms, motions, quantity))), strict=True)
     value, *gradients = (float(np.abs(a - b).max()) for a, b in pairs)
     error = {"value": value, **({"gradient": max(gradients)} if gradients else {})}
     return {**timing.summary(), "pairs_per_s": batch / timing.median, "largest_error": error}
@@ -122,7 +128,7 @@ def run(method: str, arms: Arms, batch: int, quantity: str) -> Row:
 
 def sweep(name: str, cases: dict[int, tuple[Arms, int]], method: str) -> Iterator[Row]:
     """A method on cases of increasing size; it ends with the first one that fails or takes too long."""
-    for quantity in QUANTITIES if method == "mimic" else ("value", "gradient"):
+    for quantity in QUANTITIES if method in ("mimic", HAND) else ("value", "gradient"):
         for size, (arms, batch) in cases.items():
             row: Row = {"sweep": name, "size": size, "batch": batch, "method": method, "quantity": quantity}
             try:
