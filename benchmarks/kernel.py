@@ -4,9 +4,10 @@
 
 All methods compute the embodiment distance of joint positions and velocities in the default metric; "gradient" also
 its gradient with respect to the learner's motion, "all" to that of both arms. Batches are of the Panda with 7 joints
-and the one with 4; links are those of two planar arms. `mimic` is `motion_distance` of the links,
-"mimic, with hands" that of the default metric, `composition` the parts of the first called separately, `matrices` a straightforward JAX program on 4x4 matrices, `torch` the same in PyTorch, where it is
-installed. Limits of the device are the memory traffic of a copy, and the rate of fused multiply-adds.
+and the one with 4; links are those of two planar arms. `mimic` is `motion_distance` of the links, "mimic, with hands"
+that of the default metric, `composition` the parts of the first called separately, `matrices` a straightforward JAX
+program on 4x4 matrices, `torch` the same in PyTorch, where it is installed. Limits
+of the device are the memory traffic of a copy, and the rate of fused multiply-adds.
 """
 
 import dataclasses
