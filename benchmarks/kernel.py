@@ -61,7 +61,7 @@ def planar_pair(links: int) -> Arms:
 def jax_function(method: str, arms: Arms, quantity: str) -> Callable[..., Any]:
     case = arms.expert, arms.learner, arms.correspondence, WEIGHTS
 
-    hands = {"hand_weights": HANDS} if "hands" in method else {}
+    hands: Any = {"hand_weights": HANDS} if "hands" in method else {}
 
     def composition(*motion: jax.Array) -> jax.Array:
         states = mimic.link_states(arms.expert, *motion[:2]), mimic.link_states(arms.learner, *motion[2:])

@@ -141,7 +141,7 @@ def collect(folder: Path) -> dict[str, list[Row]]:
     for run in find_runs(folder)[0]:
         run_dir = folder / run.name
         report = json.loads((run_dir / REPORT).read_text())
-        entry = {"seed": run.seed, **{key: report[key] for key in STUDY["entries"]}}
+        entry = {"seed": run.seed, **{key: report[key] for key in STUDY["entries"] if key in report}}
         if gaps := list(run.curves["train"].values()):
             entry |= {"best_gap": min(gaps), "final_gap": gaps[-1], "env_steps": report["env_steps"]}
         entry |= {key: report[key] for key in ("frequency_rad_s", "starts", "similarity") if report.get(key)}

@@ -20,6 +20,7 @@ import argparse
 import copy
 import dataclasses
 import functools
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -203,6 +204,8 @@ def controllers(env: HardwareEnv) -> dict[str, Callable[[Array], Callable[[State
 def rows(options: argparse.Namespace) -> Iterator[Row]:
     """The rows of all sets."""
     groups = policies_of(options.runs)
+    if len({cast(WorldConfig, policies[0][1].env.world).expert == "exact" for policies in groups}) > 1:
+        sys.exit("error: --runs: expected runs of exact experts, or of measured ones, got both")
     histories = [cast(WorldConfig, policies[0][1].env.world).history for policies in groups]
     run, config = groups[int(np.argmax(histories))][0]
     unseen = test_motions(config.env, options.count)

@@ -42,7 +42,7 @@ print(f"reward of the first step, without any torque: {float(state.reward):.4f}"
 # ---- Training --------------------------------------------------------------------------------------------------------
 #
 # PPO with 256 arms in parallel. This is short: about 180,000 steps and 16 demonstrations. The defaults are 124
-# demonstrations, and 3 million steps on CPUs or 150 million on a GPU. `python -m mimic.train --help` lists all keys.
+# demonstrations, and 2 million steps on CPUs or 150 million on a GPU. `python -m mimic.train --help` lists all keys.
 
 run = out / "run"
 command(

@@ -12,18 +12,17 @@ from benchmarks.common.cells import Cells, Results
 PACKAGE = Path(__file__).resolve().parents[2] / "mimic"
 # Folders of the package that numbers depend on, each above those that it imports, see tests/test_layers.py.
 FOLDERS = (
-    *("xml", "control", "arms", "metric", "physics", "motions"),
+    *("xml", "base", "control", "arms", "metric", "physics", "motions"),
     *("retargeting", "envs", "evaluation", "trainers", "conf"),
 )
 # Benchmarks that measure up to a folder; all others measure trained policies, and so all folders.
 HIGHEST = {
     **dict.fromkeys(("hands", "models"), "arms"),
     "kernel": "metric",
-    **dict.fromkeys(("any_arm_kernel", "physics"), "physics"),
     **dict.fromkeys(
-        ("bound", "costs", "exact_hands", "motion_capture", "pose", "similarity", "teleoperation", "transfer"),
-        "retargeting",
+        ("bound", "costs", "exact_hands", "pose", "similarity", "teleoperation", "transfer"), "retargeting"
     ),
+    **dict.fromkeys(("any_arm_kernel", "physics"), "envs"),
 }
 
 

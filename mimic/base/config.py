@@ -114,6 +114,7 @@ def check_unused(config: Any, keys: Collection[str], reason: str, prefix: str = 
       reason: what follows "expected none", such as "with run=DIR".
       prefix: of the keys in the message.
     """
+    assert set(keys) <= {field.name for field in dataclasses.fields(config)}, keys
     for field in dataclasses.fields(config):
         factory, value = field.default_factory, getattr(config, field.name)
         default = field.default if factory is dataclasses.MISSING else factory()

@@ -100,7 +100,8 @@ class EvaluateConfig:
     def _check_robot(self) -> None:
         """Raises a `ValueError` for options of another kind of evaluation."""
         if not self.robot:
-            check_unused(self, ("robot_world", "robot_loop", "edges"), "without robot=, as in robot=virtual_panda")
+            keys = "episodes", "robot_world", "robot_loop", "edges", "seed"
+            check_unused(self, keys, "without robot=, as in robot=virtual_panda")
             return
         check_choice("robot", self.robot, ROBOTS)
         check_choice("robot_loop", self.robot_loop, ROBOT_LOOPS)

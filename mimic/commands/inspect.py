@@ -33,6 +33,7 @@ from mimic.commands.printed import train_command  # noqa: E402
 from mimic.envs.config import EnvConfig  # noqa: E402
 from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402
 from mimic.motions.demonstrations import Demonstrations  # noqa: E402
+from mimic.runs.files import finite  # noqa: E402
 from mimic.trainers.progress import similarity_table  # noqa: E402
 
 _PICTURE, _RESULTS = "arms.png", "inspection.json"
@@ -172,7 +173,7 @@ def _write(path: Path, inspection: Inspection, expert: Arm, learner: Arm) -> Non
         "hand": inspection.reach and inspection.reach.summary(),
         "train": inspection.command,
     }
-    path.write_text(json.dumps(results, indent=2) + "\n")
+    path.write_text(json.dumps(finite(results), indent=2, allow_nan=False) + "\n")
 
 
 def _joints(arm: Arm, config: ArmConfig, env: EnvConfig) -> list[dict[str, Any]]:

@@ -15,7 +15,8 @@ class SeenExpert(NamedTuple):
     """Measured link states of an expert at several ticks.
 
     Attributes:
-      states: [ticks, links, 3] each; 0 where a link is not visible, and None for what is not measured at all.
+      states: [ticks, links, 3] each; 0 where a link is not visible, and None for what is not measured at all. Of a hand
+        only the axes are measured.
       visible: [ticks, links] whether each link is visible. A hand is visible with the last link.
     """
 
@@ -37,7 +38,7 @@ def see(world: WorldConfig, states: LinkStates, key: Array, step: Array, dt: flo
 
     Positions and directions have independent noise at each tick. Velocities are those of differences of two
     measurements, so that their noise is that of the positions over `dt`, and negatively correlated in time. What is
-    measured at a tick is the same whenever it is observed.
+    measured at a tick is the same whenever it is observed; a velocity is 0 where the tick before was lost.
 
     Args:
       world: `expert` says what is measured; `expert_noise`, `expert_loss` and `hidden_links` how well.
@@ -61,18 +62,21 @@ def see(world: WorldConfig, states: LinkStates, key: Array, step: Array, dt: flo
     noise, lost = jax.vmap(drawn)(step + jnp.arange(ticks + 1))  # the first is that of the tick before
     of_positions, of_directions, of_axes = jnp.split(noise, [links, 2 * links], axis=1)
     visible = ~(hidden | lost[1:, None])
+    moving = visible & ~lost[:-1, None]
 
     def measured(true: Array, noise: Array, is_visible: Array = visible) -> Array:
         return jnp.where(is_visible[..., None], true + noise, 0.0)
 
     position = measured(states.position, of_positions[1:])
-    linear_velocity = measured(states.linear_velocity, jnp.diff(of_positions, axis=0) / dt)
+    linear_velocity = measured(states.linear_velocity, jnp.diff(of_positions, axis=0) / dt, moving)
     if world.expert == "points":
         return SeenExpert(LinkStates(position, None, linear_velocity, None), visible)
     assert states.direction is not None and states.angular_velocity is not None
     direction = measured(states.direction, of_directions[1:])
-    angular_velocity = measured(states.angular_velocity, jnp.diff(of_directions, axis=0) / dt)
+    angular_velocity = measured(states.angular_velocity, jnp.diff(of_directions, axis=0) / dt, moving)
     hand = states.hand
     if hand is not None:
-        hand = dataclasses.replace(hand, axes=measured(hand.axes, of_axes[1:], visible[:, -1:]))
+        unknown = jnp.full_like(hand.position, jnp.nan)
+        axes = measured(hand.axes, of_axes[1:], visible[:, -1:])
+        hand = dataclasses.replace(hand, axes=axes, position=unknown, angular_velocity=unknown)
     return SeenExpert(LinkStates(position, direction, linear_velocity, angular_velocity, hand), visible)

@@ -273,7 +273,7 @@ def control_observation(
       env: the environment.
       measured: measured angles [rad] and velocities [rad/s], and those of the reference.
       past_actions: the last actions that were sent, the newest first.
-      expert: see `expert_vector`.
+      expert: see `expert_vector`, or `SeenExpert.vector` where the expert is measured.
     """
     qpos, qvel, reference_qpos, reference_qvel = jnp.split(measured, 4)
     own = observed_parts(link_states(env.learner, qpos, qvel))

@@ -133,7 +133,8 @@ def _improved(
         return chosen, costs.sum()
 
     candidates, totals = jax.vmap(attempt)(jnp.asarray(_LINE_SEARCH))
-    return candidates[jnp.argmin(jnp.where(jnp.isnan(totals), jnp.inf, totals))]
+    totals = jnp.where(jnp.isfinite(totals), totals, jnp.inf)  # stiff arms can diverge in the model's few substeps
+    return jnp.where(jnp.isfinite(totals).any(), candidates[jnp.argmin(totals)], actions)
 
 
 def _without_negative(matrices: Float[Array, "steps n n"]) -> Float[Array, "steps n n"]:

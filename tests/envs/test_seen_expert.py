@@ -38,7 +38,7 @@ def seen(states, keys: Any = 0, step: int = 0, **world):
 def test_without_noise_and_gaps_it_is_the_expert(states):
     result = seen(states)
     assert np.all(result.visible)
-    jax.tree.map(np.testing.assert_array_equal, result.states, states)
+    jax.tree.map(np.testing.assert_array_equal, observed_parts(result.states), observed_parts(states))
     rows = [np.asarray(x).reshape(TICKS, -1) for x in [*observed_parts(states), np.ones(result.visible.shape)]]
     np.testing.assert_array_equal(result.vector(), np.concatenate(rows, axis=1).ravel())
 
@@ -64,6 +64,13 @@ def test_a_tick_is_measured_once(states):
     whole = seen(states, **settings)
     later = seen(jax.tree.map(lambda x: x[7:12], states), step=7, **settings)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[7:12], atol=1e-5), later, whole)
+
+
+def test_no_velocity_is_seen_where_the_tick_before_was_lost(states):
+    result = seen(states, expert_loss=0.3, expert_noise=[NOISE, NOISE])
+    lost = ~np.asarray(result.visible).any(axis=1)
+    assert lost.any() and not np.any(result.states.linear_velocity[1:][lost[:-1]])
+    assert np.any(result.states.linear_velocity[1:][~lost[:-1]])
 
 
 def test_hidden_links_are_hidden_for_a_whole_episode_and_lost_ticks_as_a_whole(states):

@@ -56,7 +56,7 @@ def rows(metrics: Metrics) -> list[Row]:
         rows.insert(4, ("energy distance", *_texts("{:.4f}", metrics["energy_distance"])))
     rows[1:1] = _rows_of_kinds(metrics["by_kind"])
     gap, late = metrics["optimality_gap"], metrics["late_gap"]
-    if any(late[split] < _EARLY * gap[split] for split in SPLITS):
+    if any(gap[split] > 0 and late[split] < _EARLY * gap[split] for split in SPLITS):
         rows.insert(1, ("  in the second half", *_texts("{:.2%}", late)))
     rows += [
         (f"reward term {key.removeprefix('reward.')}", *_texts("{:.4f}", value))

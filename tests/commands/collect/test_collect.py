@@ -131,7 +131,7 @@ def test_what_is_left_out_is_named_and_the_rest_is_kept(six, capsys):
     named = capsys.readouterr().err.splitlines()
     assert named == [f"left out: {run['name']}: {run['reason']}" for run in collected(six)["left_out"]]
     reasons = {run["name"]: run["reason"] for run in collected(six)["left_out"]}
-    assert "at 2,000 of 3,000,000 steps; continue with: python -m mimic.train resume=" in reasons["stopped"]
+    assert "at 2,000 of 2,000,000 steps; continue with: python -m mimic.train resume=" in reasons["stopped"]
     assert "diverged" in reasons["diverged"] and "optimality_gap.train" in reasons["diverged"]
     assert "report.json cannot be read" in reasons["torn"]
     assert "of mimic 0.0.1, and this is" in reasons["of-old"] and "momentum" in reasons["of-old"]
