@@ -6,7 +6,7 @@
     python -m benchmarks.transfer FOLDER ... --data DATA           # beside it: recorded teleoperation, again
 
 PYTHON is one with robosuite. FOLDER/NAME/NAME.xml are its arms with the Panda's gripper. The base is from `base=auto`.
-Rows of pairs are kept in DIR. Those of the same code are not measured again, so that processes with other arms or
+Rows are kept in DIR. Those of the same code and folders are not measured again, so that processes with other arms or
 tasks share the work, and an interrupted run can be continued.
 
 The check is C MuJoCo's, of the written data set: hands are sites of both models, `exact` are frames within 1 mm and
@@ -109,7 +109,9 @@ def with_speeds(folder: str, name: str) -> Path:
     custom = root.find("custom")
     custom = ET.SubElement(root, "custom") if custom is None else custom
     ET.SubElement(custom, "numeric", name=VELOCITY_LIMIT, data=" ".join(map(str, SPEEDS[name])))
-    path.write_text(ET.tostring(root, encoding="unicode"))
+    partial = path.with_name(f"{path.name}.{os.getpid()}")  # processes that share the work may write at the same time
+    partial.write_text(ET.tostring(root, encoding="unicode"))
+    os.replace(partial, path)
     return path
 
 
@@ -272,29 +274,24 @@ def teleoperation(options: argparse.Namespace) -> Iterator[Row]:
         yield as_numbers(row)
 
 
-def in_physics(options: argparse.Namespace, expert: Model, method: str, rows: list[Row]) -> list[Row]:
-    """Task success of an arm's motions by a method: the Panda's own, mimic's, copied joints or those of seeded ssik."""
-    work, jobs, name = Path(options.work).absolute(), [], rows[0]["learner"]
+def in_physics(options: argparse.Namespace, expert: Model, method: str, row: Row) -> list[Row]:
+    """Task success of an arm's motion by a method: the Panda's own, mimic's, copied joints or those of seeded ssik."""
+    work, name, task = Path(options.work).absolute(), row["learner"], row["task"]
     arm = build_arm(ArmConfig(model=str(with_speeds(options.folder, name))), "hardware").embodiment
-    for row in rows:
-        folder, path = (
-            Path(options.demonstrations).absolute() / row["task"],
-            work / f"{row['task']}_{name}_{method}.npy",
-        )
-        with h5py.File(folder / "demo.hdf5") as file:
-            qpos = np.asarray(file[f"{_EPISODE}/states"], float)[:, 1:8]
-        if method == "mimic":
-            qpos = np.load(work / f"{row['task']}_{name}.npy")
-        elif method == "ssik":
-            qpos = followed_by_ssik(arm, targets(expert, qpos, row["base"]), np.asarray(arm.home, float))
-        elif method == "copied":
-            qpos = np.clip(qpos[:, : arm.num_joints], *arm.joint_range.T)
-        np.save(path, qpos)
-        frames = [len(qpos) // 2, len(qpos) - 1] if method == "mimic" else []
-        job = {"task": row["task"], "robot": name, "method": method, "base": row["base"], "motion": str(path)}
-        jobs.append({**job, "frames": frames, "demonstration": str(folder)})
-    files = [work / f"{kind}_{name}_{method}.json" for kind in ("jobs", "replays")]
-    files[0].write_text(json.dumps(jobs))
+    folder, path = Path(options.demonstrations).absolute() / task, work / f"{task}_{name}_{method}.npy"
+    with h5py.File(folder / "demo.hdf5") as file:
+        qpos = np.asarray(file[f"{_EPISODE}/states"], float)[:, 1:8]
+    if method == "mimic":
+        qpos = np.load(work / f"{task}_{name}.npy")
+    elif method == "ssik":
+        qpos = followed_by_ssik(arm, targets(expert, qpos, row["base"]), np.asarray(arm.home, float))
+    elif method == "copied":
+        qpos = np.clip(qpos[:, : arm.num_joints], *arm.joint_range.T)
+    np.save(path, qpos)
+    frames = [len(qpos) // 2, len(qpos) - 1] if method == "mimic" else []
+    job = {"task": task, "robot": name, "method": method, "base": row["base"], "motion": str(path)}
+    files = [work / f"{kind}_{task}_{name}_{method}.json" for kind in ("jobs", "replays")]
+    files[0].write_text(json.dumps([{**job, "frames": frames, "demonstration": str(folder)}]))
     script = Path(__file__).with_name("robosuite_replay.py")
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     subprocess.run([options.physics, str(script), "replay", *map(str, files)], check=True, env=environment)
@@ -304,8 +301,11 @@ def in_physics(options: argparse.Namespace, expert: Model, method: str, rows: li
 
 
 def kept(options: argparse.Namespace, path: Path, measure: Callable[[], Any]) -> Any:
-    """A row, or rows, from a file if that is of the same code, or measured and written there."""
+    """A row, or rows, from a file if that is of the same code and folders, or measured and written there."""
     code = measured_code.hashes(options.benchmark)
+    for folder in (measured_code.PACKAGE / "commands", Path(__file__).resolve().parent):
+        code[folder.name] = measured_code.hash_of(folder)
+    code |= {name: str(Path(getattr(options, name)).resolve()) for name in ("folder", "demonstrations")}
     if path.exists() and (content := json.loads(path.read_text()))["code"] == code:
         return content["rows"]
     rows = measure()
@@ -337,9 +337,9 @@ def main(arguments: list[str] | None = None) -> None:
     own = [{"learner": "panda", "task": task, "base": [0.0] * 4} for task in options.tasks]
     for method in ("recorded", *options.methods) if options.physics else ():
         for name in options.arms if method in METHODS else ("panda",):
-            rows = [row for row in own + content["pairs"] if row["learner"] == name]
-            measure = functools.partial(in_physics, options, expert, method, rows)
-            content["physics"] += kept(options, Path(options.work) / f"physics_{name}_{method}.json", measure)
+            for row in (row for row in own + content["pairs"] if row["learner"] == name):
+                path = Path(options.work) / f"physics_{row['task']}_{name}_{method}.json"
+                content["physics"] += kept(options, path, functools.partial(in_physics, options, expert, method, row))
             write_results(options, **content)
     if options.data:
         path = Path(options.work) / "teleoperation.json"
