@@ -49,17 +49,18 @@ def parse_sample(line: bytes) -> Sample:
         content = json.loads(line)
     except (ValueError, RecursionError) as error:
         raise ValueError("expected a line of JSON") from error
-    if not isinstance(content, dict) or not isinstance(content.get("points", content.get("hand")), dict):
+    content: dict[str, Any] = content if isinstance(content, dict) else {}
+    of_hand = not isinstance(content.get("points"), dict)  # points count first, whatever else a line has
+    if of_hand and not isinstance(content.get("hand"), dict):
         raise ValueError("expected an object with 'time' and 'points' or 'hand'")
     time: Any = content.get("time")
-    points = content.get("points", {})
+    points: dict[str, Any] = {} if of_hand else content["points"]
     if not is_number(time) or not math.isfinite(time):
         raise ValueError("time: expected a finite number of seconds")
     if len(points) > MAX_POINTS or any(len(name) > _MAX_NAME for name in points):
         raise ValueError(f"points: expected at most {MAX_POINTS}, with names of at most {_MAX_NAME} characters")
     positions = np.array([_position(name, point) for name, point in points.items()], float).reshape(-1, 3)
-    hand = parse_hand(content) if "hand" in content else None
-    return Sample(float(time), dict(zip(points, positions, strict=True)), hand)
+    return Sample(float(time), dict(zip(points, positions, strict=True)), parse_hand(content) if of_hand else None)
 
 
 def _position(name: str, point: Any) -> tuple[float, float, float]:

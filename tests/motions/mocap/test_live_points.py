@@ -42,6 +42,12 @@ def test_a_sample_comes_back_from_its_line(samples):
         np.testing.assert_array_equal(sample.points[name], points[name])
 
 
+def test_points_count_whatever_hand_is():
+    for hand in (b"3", b"null", b'{"position": [0, 0, 0]}'):
+        sample = parse_sample(b'{"time": 1, "points": {"a": [1, 2, 3]}, "hand": %s}' % hand)
+        assert list(sample.points) == ["a"] and sample.hand is None
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [
