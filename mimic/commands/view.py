@@ -117,9 +117,9 @@ def _session(config: ViewConfig, env: EnvConfig) -> LiveSession:
 def _finish(config: ViewConfig, session: LiveSession) -> None:
     """Ends a session, and writes what the hand drove; further data sets have numbers."""
     session.finish()
-    number = 0
+    first, number = Path(config.record).expanduser(), 0
     for recorder in session.driven:
-        while os.path.lexists(folder := f"{config.record}-{number}" if number else config.record):
+        while os.path.lexists(folder := first.with_name(f"{first.name}-{number}") if number else first):
             number += 1
         recorder.write(folder)
         print(f"view: {recorder.episodes} episodes in {folder}", flush=True)

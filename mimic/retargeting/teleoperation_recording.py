@@ -30,6 +30,9 @@ class TeleoperationRecorder:
     Args:
       operator: the teleoperator, with a whole number of ticks per second.
 
+    Attributes:
+      operator: the same; another one of the same arms and rate may replace it, and begins an episode.
+
     Raises:
       ValueError: another rate.
     """
@@ -38,7 +41,8 @@ class TeleoperationRecorder:
         self.operator = operator
         frames_per_second(operator.period)
         self._episodes: list[list[_Tick]] = []
-        self._engagement, self._opening = -1, np.nan
+        self._engagement: tuple[Teleoperator, int] | None = None  # the episode's
+        self._opening = np.nan
 
     @property
     def episodes(self) -> int:
@@ -63,9 +67,9 @@ class TeleoperationRecorder:
         command = operator.step(leader_qpos, gripper, time)
         opening = np.nan if command.gripper is None else command.gripper
         if operator.is_engaged and operator.leader_qpos is not None:
-            if self._engagement != operator.engagements:
+            if self._engagement != (engagement := (operator, operator.engagements)):
                 self._episodes.append([])
-                self._engagement, self._opening = operator.engagements, opening
+                self._engagement, self._opening = engagement, opening
             openings = self._opening, opening
             self._episodes[-1].append(_Tick(operator.leader_qpos, before, command.qpos, openings))
         self._opening = opening

@@ -80,7 +80,7 @@ class PointControls:
         if isinstance(self._tracker, HandTracker):
             goal = self._tracker.advance(dt, lambda: hand_poses(self._session.expert, self._session.pose)[0])
             if goal is not None:
-                self._session.drag_hand(goal)
+                self._session.drag_hand(goal, self._tracker.gripper)
         else:
             pose, paused = self._tracker.advance(dt)
             if pose is not None:

@@ -122,12 +122,17 @@ class Said:
 
 
 class HandTracker:
-    """Drags the hand of an arm as the hand moves whose poses arrive, from where both are after a pause."""
+    """Drags the hand of an arm as the hand moves whose poses arrive, from where both are after a pause.
+
+    Attributes:
+      gripper: opening in the last sample, in the sender's units; None where unknown.
+    """
 
     def __init__(self, listener: PointListener):
         self._listener = listener
         self._then: tuple[np.ndarray, np.ndarray] | None = None  # poses of both hands
         self._paused = PAUSE  # s since the last pose
+        self.gripper: float | None = None
 
     def advance(self, dt: float, arm_hand: Callable[[], Float[np.ndarray, "4 4"]]) -> np.ndarray | None:
         """The goal [4, 4] of the arm's hand [m]; None where no pose has arrived. `arm_hand` gives where it is."""
@@ -137,7 +142,7 @@ class HandTracker:
             return None
         if self._then is None or self._paused >= PAUSE:
             self._then = sample.hand.pose, arm_hand()
-        self._paused, (then, start) = 0.0, self._then
+        self._paused, (then, start), self.gripper = 0.0, self._then, sample.hand.gripper
         goal = start.copy()
         goal[:3, 3] += sample.hand.pose[:3, 3] - then[:3, 3]
         goal[:3, :3] = sample.hand.pose[:3, :3] @ then[:3, :3].T @ start[:3, :3]

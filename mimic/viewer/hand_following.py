@@ -11,10 +11,12 @@ from jaxtyping import Float
 
 from mimic.arms.arm import build_arm, finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import continuous_joints
 from mimic.base.config import check_choice
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.live_pose import ArmRows, LivePose
+from mimic.retargeting.pose import wrap_angles
 from mimic.retargeting.teleoperation import HANDS as FOLLOWED
 from mimic.retargeting.teleoperation import TeleoperationStatus, Teleoperator
 from mimic.retargeting.teleoperation_recording import TeleoperationRecorder
@@ -57,18 +59,21 @@ class HandFrame(NamedTuple):
     Attributes:
       positions, rotations: goals of the learner's hands in its base frame [m]; none before the first one.
       status: of the teleoperator.
+      gripper: opening of the learner's; None where unknown.
     """
 
     positions: Float[np.ndarray, "hands 3"]
     rotations: Float[np.ndarray, "hands 3 3"]
     status: TeleoperationStatus
+    gripper: float | None = None
 
     @property
     def note(self) -> str:
         """The status in words."""
         state, reason, position, rotation = self.status
         error = "" if math.isnan(position) else f", {position:.1f} mm and {rotation:.1f} deg from its goal"
-        return f"hand {state}{error}" + (f"\n{reason}" if reason else "")
+        gripper = "" if self.gripper is None else f", gripper at {self.gripper:.2f}"
+        return f"hand {state}{error}{gripper}" + (f"\n{reason}" if reason else "")
 
 
 class HandFollower:
@@ -80,7 +85,7 @@ class HandFollower:
       is_recorded: whether what is driven is kept.
 
     Attributes:
-      recorders: of what was driven, one for each teleoperator.
+      recorders: of what was driven, one each time that other joints of the learner are locked.
     """
 
     def __init__(self, expert: Embodiment, env: EnvConfig, is_recorded: bool = False):
@@ -89,6 +94,9 @@ class HandFollower:
         self._teleoperator: Teleoperator | None = None
         self._made_of: Any = None  # what the teleoperator is made of
         self._is_engaged, self._left = False, 0.0
+        self._continuous = continuous_joints(expert)
+        self._expert_qpos: np.ndarray | None = None  # of the last frame [rad]
+        self._recorded: Mapping[str, float] | None = None  # locked joints of the last recorder
 
     def stop(self) -> None:
         """Forgets the motion; the next step begins where the learner is then."""
@@ -101,6 +109,7 @@ class HandFollower:
         qpos: Float[np.ndarray, " learner_joints"],
         expert_qpos: Float[np.ndarray, " joints"],
         dt: float,
+        gripper: float | None = None,
     ) -> tuple[Float[np.ndarray, " learner_joints"], HandFrame]:
         """The learner's pose [rad] after a time [s], and what is shown of its hand.
 
@@ -110,6 +119,7 @@ class HandFollower:
           qpos: the learner's pose [rad].
           expert_qpos: the expert's pose [rad].
           dt: the time [s].
+          gripper: opening of the expert's, 0 to 1; None where unknown.
 
         Raises:
           ValueError: see `Teleoperator`.
@@ -117,7 +127,7 @@ class HandFollower:
         made_of = dataclasses.replace(settings, is_engaged=True), tuple(locked.items())
         if self._teleoperator is None or self._made_of != made_of:
             self._teleoperator, self._made_of = self._make(settings, locked, qpos), made_of
-            self._is_engaged, self._left = False, 0.0
+            self._is_engaged, self._left, self._expert_qpos = False, 0.0, None
         operator = self._teleoperator
         if settings.is_engaged != self._is_engaged:
             (operator.engage if settings.is_engaged else operator.disengage)()
@@ -125,10 +135,12 @@ class HandFollower:
         ticks = max(int(self._left + dt * _RATE), 1)
         self._left = max(self._left + dt * _RATE - ticks, 0.0)
         drive = self.recorders[-1].step if self._is_recorded else operator.step
-        for _ in range(ticks):
-            command = drive(expert_qpos)
+        last, self._expert_qpos = self._expert_qpos, np.array(expert_qpos, float)
+        moved = wrap_angles(self._expert_qpos - (self._expert_qpos if last is None else last), self._continuous)
+        for rest in np.arange(ticks)[::-1] / ticks:
+            command = drive(self._expert_qpos - rest * moved, gripper)
         goal = operator.goal or (np.zeros((0, 3)), np.zeros((0, 3, 3)))
-        return command.qpos, HandFrame(*goal, command.status)
+        return command.qpos, HandFrame(*goal, command.status, command.gripper)
 
     def _make(self, settings: HandSettings, locked: Mapping[str, float], qpos: np.ndarray) -> Teleoperator:
         config = dataclasses.replace(self._env.learner, home=None, locked=dict(locked))
@@ -139,8 +151,11 @@ class HandFollower:
             rate=_RATE, velocity=finite_velocity_limit(arm), metric=self._env.metric,
         )  # fmt: skip
         operator.reset(np.clip(qpos, *operator.limits.position.T))
-        if self._is_recorded:
+        if self._is_recorded and self._recorded == locked:
+            self.recorders[-1].operator = operator
+        elif self._is_recorded:
             self.recorders.append(TeleoperationRecorder(operator))
+            self._recorded = dict(locked)
         return operator
 
 

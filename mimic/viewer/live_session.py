@@ -111,6 +111,7 @@ class LiveSession:
         self._seeks = False  # whether the learner is on its way to the best pose while the expert moves
         self._solved: tuple[Any, np.ndarray, float] | None = None  # request, best pose and bound
         self._drag, self._follower = HandDrag(self.expert), HandFollower(self.expert, env, is_recorded)
+        self._gripper: float | None = None  # opening of the expert's
         self._active = self.settings  # the last settings with compiled functions
         self._rest_key: Any = None  # request for which the learner is at rest
 
@@ -134,12 +135,19 @@ class LiveSession:
             pose[joint] = np.clip(angle, *self.expert.joint_range[joint])
             self._pose, self._rest_time, self._goal = pose, 0.0, None
 
-    def drag_hand(self, goal: Float[np.ndarray, "4 4"]) -> None:
-        """Moves the expert's first hand to a pose in its base frame [m], as near as it gets; NaN is dropped."""
+    def drag_hand(self, goal: Float[np.ndarray, "4 4"], gripper: float | None = None) -> None:
+        """Moves the expert's first hand to a pose in its base frame [m], as near as it gets; NaN is dropped.
+
+        Args:
+          goal: the pose.
+          gripper: the opening, 0 to 1, that a learner takes whose hand follows; None leaves it.
+        """
         if not np.all(np.isfinite(goal)):
             return
         with self._lock:
             self._motion, self._goal, self._drag.goal = None, None, goal
+            if gripper not in (None, self._gripper):
+                self._gripper, self._rest_key = gripper, None
 
     def show_pose(self, pose: Float[np.ndarray, " joints"]) -> None:
         """Sets the expert's pose [rad], one of a motion: the learner tracks it from where it is."""
@@ -278,7 +286,7 @@ class LiveSession:
           ValueError: the settings are not possible; the hand is left to the metric.
         """
         try:
-            qpos, hand = self._follower.step(self.hand, self._active.locked, current, self._pose, dt)
+            qpos, hand = self._follower.step(self.hand, self._active.locked, current, self._pose, dt, self._gripper)
         except ValueError:
             self.hand = dataclasses.replace(self.hand, hand=FREE)
             raise

@@ -106,7 +106,7 @@ def test_a_hand_drags_the_arm_s_from_where_both_are():
     """Poses after a pause move nothing at first, as the hand may then be anywhere."""
     turned, arm_hand = np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])
     turned[:3, :3], turned[:3, 3], arm_hand[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.1, 0, 0.2], [0.5, 0, 0.4]
-    samples = [Sample(t, {}, LiveHand(pose, None)) for t, pose in enumerate([np.eye(4), turned, turned])]
+    samples = [Sample(t, {}, LiveHand(pose, 0.5)) for t, pose in enumerate([np.eye(4), turned, turned])]
     tracker = HandTracker(Listener([*samples[:2], Sample(2.0, {}), samples[2]]))  # type: ignore[arg-type]
     goals: list[Any] = [tracker.advance(dt, lambda: arm_hand) for dt in (0.1, 0.1, 2.0, 0.1)]
     np.testing.assert_allclose(goals[0], arm_hand)
@@ -114,6 +114,7 @@ def test_a_hand_drags_the_arm_s_from_where_both_are():
     np.testing.assert_allclose(goals[1], expected, atol=1e-12)
     assert goals[2] is None
     np.testing.assert_allclose(goals[3], arm_hand)
+    assert tracker.gripper == 0.5
     assert tracker.state == "poses of a hand arrive"
 
 

@@ -75,19 +75,37 @@ def test_a_clutch_takes_up_the_motion_where_it_is(panda, env):
 
 
 def test_what_is_driven_is_a_data_set(panda, env, tmp_path, capsys):
-    """Each closing of the clutch begins an episode, and another place of the base another data set."""
+    """Each closing of the clutch and other place of the base begin an episode; other locks, another data set."""
     pytest.importorskip("pyarrow", reason="needs pyarrow")
     session = LiveSession(env, hand=HandSettings("relative"), is_recorded=True)
     follower, learner = session._follower, np.array([0.3, -1.2, 1.4, -1.0, -1.2, 0.2])
     for settings in ({"is_engaged": True}, {"is_engaged": False}, {"is_engaged": True}, {"base": (0.1, 0, 0, 0)}):
         learner, _ = run(follower, HandSettings("relative", **settings), learner, HOME, 0.2)
-    config = ViewConfig(env=env, record=str(tmp_path / "driven"))
+    names = build_arm(env.learner).embodiment.joint_names
+    _, frame = follower.step(HandSettings("relative"), {names[2]: 1.4}, np.delete(learner, 2), HOME, TICK, 0.25)
+    assert frame.gripper == 0.25 and "gripper at 0.25" in frame.note
+    config = ViewConfig(env=env, record=str(tmp_path / "driven") + "/")
     view._finish(config, session)
-    assert f"2 episodes in {tmp_path}/driven\nview: 1 episodes in {tmp_path}/driven-1\n" in capsys.readouterr().out
-    motions = read_lerobot(tmp_path / "driven-1", build_arm(env.learner).embodiment.joint_names, "action").motions
-    np.testing.assert_allclose(next(iter(motions.values())).qpos[-1], learner, atol=1e-6)
+    assert f"3 episodes in {tmp_path}/driven\nview: 1 episodes in {tmp_path}/driven-1\n" in capsys.readouterr().out
+    motions = read_lerobot(tmp_path / "driven", names, "action").motions
+    np.testing.assert_allclose(list(motions.values())[-1].qpos[-1], learner, atol=1e-6)
     view._finish(config, LiveSession(env, is_recorded=True))
     assert "nothing was driven" in capsys.readouterr().out
+
+
+def test_the_expert_moves_steadily_within_a_frame(panda, env):
+    """Frames of 3 or 4 ticks in which the expert turns at 1 rad/s, with its last joint beyond half a revolution."""
+    session = LiveSession(env, hand=HandSettings("relative"), is_recorded=True)
+    follower, learner = session._follower, np.array([0.3, -1.2, 1.4, -1.0, -1.2, 0.2])
+    follower._continuous = np.arange(7) == 6
+    for frame in range(30):
+        qpos = HOME + np.eye(7)[0] * TICK * frame
+        qpos[6] = (2.9 + TICK * frame + np.pi) % (2 * np.pi) - np.pi
+        learner, _ = follower.step(HandSettings("relative"), {}, learner, qpos, TICK)
+    led = np.array([tick.leader for tick in session.driven[0]._episodes[0]])
+    moved = np.diff(led[3:], axis=0)
+    moved[:, 6] = (moved[:, 6] + np.pi) % (2 * np.pi) - np.pi
+    assert np.all(moved[:, [0, 6]] > 0.008) and np.all(moved[:, [0, 6]] < 0.0115)
 
 
 def test_what_is_out_of_reach_says_so(panda, env):
