@@ -7,37 +7,46 @@ Poses arrive at a socket of this machine, a line of JSON each. WebXR and OpenXR 
     {"time": 0.01, "hand": {"position": [0.1, 1.2, -0.3], "wxyz": [1, 0, 0, 0]}, "gripper": 0.5, "frame": "xr"}
 
 The gripper is 0 where the fingers are closed and 1 where they are open. Without "frame" the axes are x forward, y left
-and z up. A gap of more than half a second opens the clutch: the hand may then be anywhere.
+and z up. A gap of more than half a second, or a jump, opens the clutch: the hand may then be anywhere.
 """
 
 import argparse
 import contextlib
+import importlib.util
 import time
 from collections.abc import Callable
 
 import numpy as np
 
 import mimic
+from mimic.base.config import new_folder
+from mimic.motions.formats.episodes import package_error
 from mimic.motions.mocap.point_socket import PointListener
 
 GAP = 0.5  # s
 
 
 def drive(
-    listener: PointListener, operator: mimic.TeleoperationRecorder, send: Callable[[mimic.FollowerCommand], None]
+    listener: PointListener,
+    operator: mimic.Teleoperator,
+    send: Callable[[mimic.FollowerCommand], None],
+    recorder: mimic.TeleoperationRecorder | None = None,
 ) -> None:
-    """Sends a command of the newest pose; one call a tick."""
-    sample, arm = listener.take(), operator.operator
+    """Sends a command of the newest pose, and keeps it in a recorder; one call a tick."""
+    sample = listener.take()
     hand = None if sample is None else sample.hand
-    if listener.silence > GAP and arm.is_engaged:
-        arm.disengage()
-    elif hand is not None and not arm.is_engaged:
-        arm.engage()
+    if listener.silence > GAP and operator.is_engaged:
+        operator.disengage()
+    elif hand is not None and not operator.is_engaged:
+        operator.engage()
     pose, gripper = (None, None) if hand is None else hand
-    send(operator.step(pose, gripper, None if sample is None else sample.time))
+    command = (recorder or operator).step(pose, gripper, None if sample is None else sample.time)
+    if operator.is_engaged and command.status.reason.endswith("jumped"):
+        operator.disengage()  # as the headset's space was recentred: the next pose leads from where it is
+    send(command)
 
 
-def follow_hand(arm: str, rate: float, velocity: float | None) -> mimic.TeleoperationRecorder:
+def follow_hand(arm: str, rate: float, velocity: float | None) -> mimic.Teleoperator:
     """What a hand drives; its links are kept apart where its model has shapes."""
     config, capsules = mimic.ArmConfig(model=arm), None
     follower = mimic.build_arm(config, "hardware").embodiment
@@ -45,10 +54,7 @@ def follow_hand(arm: str, rate: float, velocity: float | None) -> mimic.Teleoper
         capsules = mimic.fit_capsules(config, "hardware")
     except ValueError as error:
         print(f"links are not kept apart: {error}", flush=True)
-    operator = mimic.Teleoperator(
-        None, follower, hand="relative", rate=rate, velocity=velocity, capsules=capsules
-    )  # fmt: skip
-    return mimic.TeleoperationRecorder(operator)
+    return mimic.Teleoperator(None, follower, hand="relative", rate=rate, velocity=velocity, capsules=capsules)
 
 
 def main() -> None:
@@ -61,8 +67,16 @@ def main() -> None:
     parser.add_argument("--record", help="new folder for a LeRobot data set of what was driven")
     options = parser.parse_args()
 
+    recorder, state = None, ""
     try:
-        recorder, state = follow_hand(options.arm, options.rate, options.velocity), ""
+        if options.record:
+            new_folder("record", options.record)
+            if importlib.util.find_spec("pyarrow") is None:
+                raise package_error("record", "pyarrow")
+        operator = follow_hand(options.arm, options.rate, options.velocity)
+        if options.record:
+            recorder = mimic.TeleoperationRecorder(operator)
+        listener = PointListener("localhost", options.port)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 
@@ -73,16 +87,17 @@ def main() -> None:
             state = command.status.state
             print(f"{state} {command.status.reason}", np.round(command.qpos, 2), command.gripper, flush=True)
 
-    with contextlib.closing(PointListener("localhost", options.port)) as listener:
-        print(f"poses of a hand at tcp://localhost:{listener.port}   (Ctrl-C ends it)", flush=True)
-        with contextlib.suppress(KeyboardInterrupt):
-            start, ticks = time.perf_counter(), 0
+    print(f"poses of a hand at tcp://localhost:{listener.port}   (Ctrl-C ends it)", flush=True)
+    try:
+        with contextlib.closing(listener), contextlib.suppress(KeyboardInterrupt):
+            due = time.perf_counter()
             while True:
-                drive(listener, recorder, send)
-                ticks += 1
-                time.sleep(max(0.0, start + ticks / options.rate - time.perf_counter()))
-    if options.record:
-        recorder.write(options.record)
+                drive(listener, operator, send, recorder)
+                due = max(due + 1 / options.rate, time.perf_counter())  # ticks that are late are not caught up
+                time.sleep(max(0.0, due - time.perf_counter()))
+    finally:
+        if recorder is not None and recorder.episodes:
+            recorder.write(options.record)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import socket
+import subprocess
 import sys
 import time
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.motions.mocap.live_points import parse_sample
+from mimic.motions.mocap.live_points import Sample, parse_sample
 from mimic.motions.mocap.point_socket import PointListener
 from tests.helpers.repository import REPOSITORY
 
@@ -72,7 +73,8 @@ def test_a_headset_drives_an_arm(tmp_path):
         pytest.importorskip(package, reason=f"needs {package}")
     panda, commands = mimic.panda(limits="hardware"), []
     operator = xr_teleoperation.follow_hand("panda", 100.0, None)
-    start = mimic.hand_frames(panda, operator.operator.qpos)
+    recorder = mimic.TeleoperationRecorder(operator)
+    start = mimic.hand_frames(panda, operator.qpos)
     with contextlib.closing(PointListener("localhost", 0)) as listener:
         with socket.create_connection(("localhost", listener.port)) as headset:
             for tick in range(40):
@@ -82,15 +84,40 @@ def test_a_headset_drives_an_arm(tmp_path):
                 headset.sendall(json.dumps(sample).encode() + b"\n")
                 while listener.counts.received <= tick:
                     time.sleep(1e-3)
-                xr_teleoperation.drive(listener, operator, commands.append)
+                xr_teleoperation.drive(listener, operator, commands.append, recorder)
         for _ in range(100):  # no further sample: it catches up
-            commands.append(operator.step(None))
+            commands.append(recorder.step(None))
         moved = mimic.hand_frames(panda, commands[-1].qpos).position - start.position
         np.testing.assert_allclose(moved, [[0.1, -0.05, 0]], atol=1e-3)
-        assert commands[-1].gripper == 0.5 and operator.episodes == 1
+        assert commands[-1].gripper == 0.5 and recorder.episodes == 1
         listener._arrived = -1e3
-        xr_teleoperation.drive(listener, operator, commands.append)
+        xr_teleoperation.drive(listener, operator, commands.append, recorder)
         assert commands[-1].status.state == "disengaged"
-    operator.write(tmp_path / "driven")  # of the follower alone, as a hand has no joints
+    recorder.write(tmp_path / "driven")  # of the follower alone, as a hand has no joints
     info = json.loads((tmp_path / "driven/meta/info.json").read_text())
     assert info["total_episodes"] == 1 and not any("expert" in name for name in info["features"])
+
+
+def test_a_hand_whose_space_is_recentred_leads_from_there():
+    """The pose of a hand that has jumped by 1 m opens the clutch, and the next one closes it: the arm stays."""
+    pytest.importorskip("ruckig", reason="needs ruckig")
+    operator, commands = xr_teleoperation.follow_hand("panda", 100.0, None), []
+
+    class Listener:
+        silence = 0.0
+
+        def take(self):
+            hand = hand_of([0.0, 1.2, 0.0 if len(commands) < 20 else -1.0], frame="xr")
+            return Sample(0.01 * len(commands), {}, hand)
+
+    for _ in range(60):
+        xr_teleoperation.drive(Listener(), operator, commands.append)
+    assert commands[20].status.reason.endswith("jumped") and operator.engagements == 2
+    assert {command.status.state for command in commands[21:]} == {"tracking"}
+    np.testing.assert_allclose([command.qpos for command in commands[20:]], [commands[0].qpos] * 40, atol=1e-6)
+
+
+def test_a_folder_that_exists_is_one_line_before_driving(tmp_path):
+    command = [sys.executable, REPOSITORY / "examples/xr_teleoperation.py", "panda", "--record", tmp_path]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY, timeout=120)
+    assert done.returncode == 1 and done.stderr.startswith("error: record: ") and done.stderr.count("\n") == 1
