@@ -27,7 +27,10 @@ class ArmLeader:
       arm: the leader.
       rows: its kinematics.
       ways: how its sample may change next.
+      fault: what a sample is that cannot be used, in words.
     """
+
+    fault = "not finite"
 
     def __init__(self, arm: Embodiment):
         self.arm, self.rows = arm, ArmRows(arm)
@@ -79,8 +82,10 @@ class HandLeader:
       to_base: [3, 3] that turns a row of the leader's base frame to the follower's by a product from the right.
 
     Attributes:
-      arm, rows, ways: see `ArmLeader`.
+      arm, rows, ways, fault: see `ArmLeader`.
     """
+
+    fault = "not finite, or no rotation"
 
     def __init__(self, follower: Embodiment, rows: ArmRows, reference: np.ndarray, to_base: np.ndarray):
         self.arm, self.rows = follower, rows
@@ -170,7 +175,7 @@ class Samples:
             return None
         sample = self._leader.sample(sample)
         if not self._leader.is_finite(sample) or (time is not None and not math.isfinite(time)):
-            self.reason = "ignored a sample that is not finite"
+            self.reason = f"ignored a sample that is {self._leader.fault}"
         elif time is not None and self._is_old(time):
             self.reason = "ignored a sample that is not newer than the last one"
         elif self._is_jump(sample):
