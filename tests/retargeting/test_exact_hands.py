@@ -253,11 +253,12 @@ def test_a_motion_out_of_reach_stays_continuous_and_claims_nothing_there():
     time = np.linspace(0, 6, 300)
     qpos = np.zeros((300, 7), np.float32) + np.array([0, 0.3, 0, -2.6, 0, 2.1, 0.7])
     qpos[:, 3] = -2.6 + 2.0 * np.sin(np.pi * time / 6)  # stretches the arm, and bends it again
+    qpos = np.concatenate([qpos, np.repeat(qpos[-1:], 25, axis=0)])  # bent arms are faster than stretched ones: waits
     metric, jump = MetricConfig().build(ARM, ARM), ARM.velocity_limit * (time[1] - time[0])
     base = [-0.2, 0, 0, 0]
     solution = imitate_trajectory(ARM, ARM, qpos, **metric.arguments, hand="exact", base=base, largest_jump=jump)
     exact = np.asarray(solution.hand.exact)
-    assert exact[:5].all() and exact[-5:].all() and not exact[135:165].any()
+    assert exact[:5].all() and exact[-20:].all() and not exact[135:165].any()
     assert np.asarray(solution.hand.position)[135:165].min() > 0.01
     assert np.all(np.abs(np.diff(solution.qpos, axis=0)) <= jump * (1 + 1e-5))
 
