@@ -39,6 +39,7 @@ from mimic.retargeting.pose import (
 from mimic.retargeting.pose_objective import PoseObjective, Target, pose_objective
 
 _TRACKING_ITERATIONS = 6  # Newton steps from the pose at the neighbouring time
+_REFINING_ITERATIONS = 20  # of the one path that is left; with 6 a tenth of the poses were some mrad from their minimum
 _LEAP = 1.5  # of the maximum change of a joint: a path that changes by more passes from one minimum to another
 _ANCHORS = 3  # times with a search for minima; at the others minima are tracked
 
@@ -208,7 +209,7 @@ class _Tracker:
         begin = newton(self._at(rough, anchor), guess, self.limits, ITERATIONS["newton"]).qpos
 
         def follow(past: _Past, time: Array) -> tuple[_Past, Solution]:
-            solution = self._near(rough, past, past[0], time)
+            solution = self._near(rough, past, past[0], time, _TRACKING_ITERATIONS)
             return (solution.qpos, past[0]), solution
 
         # From the anchor to the end, then back over all times, which also covers those before the anchor.
@@ -226,7 +227,7 @@ class _Tracker:
             endless = np.isinf(lower) & np.isinf(upper)
             guess = wrap_angles(guess, endless, centre=past[0])
             reached = jnp.clip(guess, past[0] - self.jump, past[0] + self.jump)
-            solution = self._near(self.objective.derivatives, past, reached, time)
+            solution = self._near(self.objective.derivatives, past, reached, time, _REFINING_ITERATIONS)
             leaps = jnp.any(jnp.abs(guess - past[0]) > _LEAP * self.jump)
             on_the_way = Solution(reached, solution.value, jnp.inf * solution.value)
             solution = jax.tree.map(lambda x, y: jnp.where(leaps, x, y), on_the_way, solution)
@@ -237,7 +238,9 @@ class _Tracker:
     def _at(self, derivatives: Callable[..., Derivatives], time: Array) -> Callable[..., Derivatives]:
         return functools.partial(derivatives, jax.tree.map(lambda x: x[time], self.targets))
 
-    def _near(self, derivatives: Callable[..., Derivatives], past: _Past, guess: Array, time: Array) -> Solution:
+    def _near(
+        self, derivatives: Callable[..., Derivatives], past: _Past, guess: Array, time: Array, iterations: int
+    ) -> Solution:
         lower, upper = self.limits
         previous, earlier = past
         reachable = jnp.maximum(lower, previous - self.jump), jnp.minimum(upper, previous + self.jump)
@@ -246,4 +249,4 @@ class _Tracker:
         def of_motion(qpos: Scalars, store: Store) -> Derivatives:
             return sum_of(of_pose(qpos, store), smoothness_derivatives(self.costs, qpos, previous, earlier))
 
-        return newton(of_motion if self.costs.of_motion else of_pose, guess, reachable, _TRACKING_ITERATIONS)
+        return newton(of_motion if self.costs.of_motion else of_pose, guess, reachable, iterations)

@@ -84,7 +84,7 @@ def test_bad_input_of_the_command(rejected):
 def test_a_data_set_of_one_arm_becomes_one_of_another(tmp_path):
     """The learner has the expert's links but other names: what is written are the expert's motions."""
     time = np.arange(0, 3, 0.05)
-    qpos = 0.4 * np.sin(time[:, None] + np.arange(7)) + [0, 0, 0, -1.5, 0, 1.5, 0]
+    qpos = 0.4 * np.sin(time[:, None] + np.arange(7)) + [0, 0.6, 0, -1.5, 0, 1.5, 0]  # axes 1 and 3 are never parallel
     rows = np.column_stack([time, qpos, np.linspace(0, 1, len(time))])
     header = ",".join(["time", *mimic.panda().joint_names, "gripper"])
     np.savetxt(tmp_path / "in.csv", rows, delimiter=",", header=header, comments="")
