@@ -122,6 +122,7 @@ def missing_torque(env: HardwareEnv, draw: Draw, episode: HardwareState) -> Arra
     return (commanded - needed).mean(axis=0)
 
 
+@jax.default_matmul_precision("highest")  # not TF32
 def estimated_angles(env: HardwareEnv) -> Array:
     """Angles [demonstrations, ticks, joints] of the expert that explain what the episodes of an evaluation measure.
 

@@ -1,4 +1,4 @@
-"""A ROS 2 node: a leader arm drives a follower of another build, from one topic of sensor_msgs/JointState to another.
+"""A ROS 2 node: a leader arm drives a follower of another embodiment, from one topic of JointState messages to another.
 
     python ros_teleoperation.py panda follower.urdf 100     # leader, follower, ticks per second
 

@@ -1,4 +1,4 @@
-"""A leader arm of LeRobot drives a follower of another build: a teleoperator, and the processor step in it.
+"""A leader arm of LeRobot drives a follower of another embodiment: a teleoperator, and the processor step in it.
 
     pip install ./examples/lerobot_teleoperator_mimic
     lerobot-teleoperate --robot.type=FOLLOWER --teleop.type=mimic \

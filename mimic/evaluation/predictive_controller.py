@@ -87,6 +87,7 @@ def ahead(known: LinkStates, dt: float) -> LinkStates:
     return jax.tree.map(lambda x, y: jnp.concatenate([x[1:], y]), known, later)
 
 
+@jax.default_matmul_precision("highest")  # not TF32
 def _improved(
     advance: Callable[[Array, Array], Array],
     cost: Callable[[Array, LinkStates], Array],

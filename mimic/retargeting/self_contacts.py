@@ -51,13 +51,13 @@ class SelfContacts:
         self._joints = arm.num_joints
         self._names = ["the base" if joint < 0 else f"the link of {arm.joint_names[joint]}" for joint in capsules.joint]
         pairs = colliding_pairs(arm, capsules)
-        self._least = APART * float(arm.chain_length)
+        self._minimum = APART * float(arm.chain_length)
         constants = clearance_constants(arm, capsules, pairs=pairs)
         lower, upper = np.clip(np.asarray(arm.joint_range).T, -np.pi, np.pi)
         poses = np.random.default_rng(0).uniform(lower, upper, (_POSES, arm.num_joints))
         poses = np.concatenate([np.asarray(arm.home, float)[None], poses])
         distances = pair_distances(*capsule_axes(poses, constants), constants)
-        is_always = np.mean(distances < self._least, axis=0) > _ALWAYS
+        is_always = np.mean(distances < self._minimum, axis=0) > _ALWAYS
         ignored = sorted({" and ".join(self._names[i] for i in pairs[pair]) for pair in np.flatnonzero(is_always)})
         if ignored:
             _log.warning("links that touch in most poses, which are not kept apart: %s", "; ".join(ignored))
@@ -75,7 +75,7 @@ class SelfContacts:
         self._moves[np.ix_(geoms, geoms)] = moves[None].astype(float) - moves[:, None]
         for (one, other), distance in zip(pairs, distances[0], strict=True):
             places = [geoms[one], geoms[other]], [geoms[other], geoms[one]]
-            self._apart[places] = min(self._least, distance)
+            self._apart[places] = min(self._minimum, distance)
         self._names = [self._names[number] for number in np.argsort(geoms)]
         self._anchors, self._axes = data.xanchor, data.xaxis
 
@@ -103,7 +103,7 @@ class SelfContacts:
     def touch(self, lanes: Float[np.ndarray, "lanes joints"]) -> Bool[np.ndarray, " lanes"]:
         """Whether links touch, or nearly do, in each pose."""
         found = [self.near(qpos) for qpos in lanes]
-        return np.array([near is not None and near.room.min() < -self._least / 2 for near in found])
+        return np.array([near is not None and near.room.min() < -self._minimum / 2 for near in found])
 
 
 def _model(arm: Embodiment, capsules: Capsules, pairs: list[tuple[int, int]]) -> mujoco.MjModel:

@@ -1,4 +1,4 @@
-"""Live teleoperation: a leader arm, a person or a hand drives a follower of another build, tick by tick.
+"""Live teleoperation: a leader arm, a person or a hand drives a follower of another embodiment, tick by tick.
 
 Each tick has three stages. A sample of the leader is checked, and gives a goal of the follower's hand. The posture
 takes steps to this goal within the velocity limits, see `mimic.retargeting.live_pose`; it never jumps to another
@@ -288,10 +288,10 @@ class Teleoperator:
 
     def _backed(self, before: np.ndarray, after: np.ndarray, near: Near) -> np.ndarray:
         """A step near walls, or a part of it that goes no deeper: walls may be curved."""
-        least = min(near.room.min(), 0.0) - _AT_WALL
+        minimum = min(near.room.min(), 0.0) - _AT_WALL
         for _ in range(_BACKED):
             now = self._contacts and self._contacts.near(after)
-            if now is None or now.room.min() >= least:
+            if now is None or now.room.min() >= minimum:
                 return after
             after = (before + after) / 2
         return before

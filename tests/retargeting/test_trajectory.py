@@ -65,7 +65,7 @@ def test_the_first_pose_lies_within_half_a_revolution():
 
 
 @pytest.mark.slow
-def test_an_arm_of_the_same_build_moves_as_the_expert():
+def test_an_equal_arm_moves_as_the_expert():
     arm = panda(limits="hardware")
     phases = np.arange(0, 3, 0.05)[:, None] + np.arange(7)
     qpos = (0.41 * np.sin(phases) + [0, 0.6, 0, -1.5, 0, 1.5, 0]).astype(np.float32)
