@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.chain import axis_rotation
 from mimic.arms.embodiment import Embodiment
+from mimic.control.clearance import body_poses
 
 # The palettes of Okabe and Ito and of Tol (indigo), which colour-blind people tell apart. Red is left to locked joints.
 PALETTE = "#332288", "#0072B2", "#56B4E9", "#009E73", "#F0E442", "#E69F00", "#CC79A7"  # base to hand
@@ -82,34 +82,30 @@ def colours_along_arm(count: int) -> Float[np.ndarray, "links 3"]:
 
 def link_ends(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.ndarray, "links 2 3"]:
     """Start and end of each link in a pose [rad], in the base frame [m]; merged links are chords."""
-    transforms = _joint_transforms(arm, qpos)
-    ends = np.empty((arm.num_links, 2, 3))
-    segment_link = np.asarray(arm.segment_link)
-    for link, joint in enumerate(arm.link_joint):
-        first, *_, last = np.repeat(np.flatnonzero(segment_link == link), 2)
-        points = np.stack([np.asarray(arm.segment_start)[first], np.asarray(arm.segment_end)[last]])
-        transform = transforms[joint + 1]
-        ends[link] = points @ transform[:3, :3].T + transform[:3, 3]
-    return ends
+    segments = [np.flatnonzero(np.asarray(arm.segment_link) == link)[[0, -1]] for link in range(arm.num_links)]
+    first, last = np.transpose(segments)
+    points = np.stack([np.asarray(arm.segment_start)[first], np.asarray(arm.segment_end)[last]], axis=1)
+    rotations, shifts = _body_poses(arm, qpos)
+    body = np.array(arm.link_joint) + 1
+    return points @ np.swapaxes(rotations[body], 1, 2) + shifts[body, None]
 
 
-def hand_poses(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.ndarray, "hands 4 4"]:
-    """The hand frame of each chain in a pose [rad], in the base frame [m]; for pictures."""
-    transforms = _joint_transforms(arm, qpos)
-    poses = np.tile(np.eye(4), (len(arm.hand_joint), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = arm.hand_rotation, arm.hand_position
-    return np.array([transforms[joint + 1] @ pose for joint, pose in zip(arm.hand_joint, poses, strict=True)])
+def hand_poses(arm: Embodiment, qpos: Float[np.ndarray, "*batch joints"]) -> Float[np.ndarray, "*batch hands 4 4"]:
+    """The hand frame of each chain in poses [rad], in the base frame [m], by NumPy alone."""
+    rotations, shifts = _body_poses(arm, qpos)
+    body = np.array(arm.hand_joint, int) + 1
+    rotation, position = rotations[..., body, :, :], np.asarray(arm.hand_position, float)[..., None]
+    poses = np.zeros((*rotation.shape[:-2], 4, 4))
+    poses[..., :3, :3] = rotation @ np.asarray(arm.hand_rotation, float)
+    poses[..., :3, 3] = (rotation @ position)[..., 0] + shifts[..., body, :]
+    poses[..., 3, 3] = 1.0
+    return poses
 
 
-def _joint_transforms(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> list[Float[np.ndarray, "4 4"]]:
-    """Transforms from the zero pose to a pose: of what no joint moves, of the first joint's link, and so on."""
-    transforms = [np.eye(4)]
-    for joint, (parent, angle) in enumerate(zip(arm.joint_parent, qpos, strict=True)):
-        axis, anchor = np.asarray(arm.joint_axis)[joint], np.asarray(arm.joint_anchor)[joint]
-        rotation = axis_rotation(axis, float(angle))
-        motion = np.block([[rotation, (anchor - rotation @ anchor)[:, None]], [np.eye(4)[3:]]])
-        transforms.append(transforms[parent + 1] @ motion)
-    return transforms
+def _body_poses(arm: Embodiment, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """See `body_poses`."""
+    axis, anchor = np.asarray(arm.joint_axis, float), np.asarray(arm.joint_anchor, float)
+    return body_poses(np.asarray(qpos, float), arm.joint_parent, axis, anchor)
 
 
 def _by_name(arm: Embodiment, colours: Float[np.ndarray, "links 3"]) -> dict[str, Colour]:

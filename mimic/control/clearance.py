@@ -66,20 +66,33 @@ def pair_distances(start: Array, end: Array, arm: ClearanceConstants) -> Array:
 
 def capsule_axes(qpos: Array, arm: ClearanceConstants) -> tuple[Array, Array]:
     """Ends [..., capsules, 3] of the capsules' axes in poses [m]; see `clearance`."""
-    batch, identity = qpos.shape[:-1], np.eye(3, dtype=arm.axis.dtype)
-    rotations = [np.broadcast_to(identity, (*batch, 3, 3))]  # of the bodies from the zero pose, the base first
-    shifts = [np.broadcast_to(0 * identity[0], (*batch, 3))]
-    angle, cross = qpos[..., None, None], np.cross(identity, arm.axis[:, None])  # cross @ x: product of axis and x
-    turns = identity + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
-    steps = arm.anchor[..., None] - turns @ arm.anchor[..., None]
-    for joint, parent in enumerate(np.asarray(arm.parent).tolist()):
-        rotation = rotations[parent + 1]
-        shifts.append(shifts[parent + 1] + (rotation @ steps[..., joint, :, :])[..., 0])
-        rotations.append(rotation @ turns[..., joint, :, :])
+    rotations, shifts = body_poses(qpos, arm.parent, arm.axis, arm.anchor)
     body = arm.joint + 1
-    rotation, shift = np.stack(rotations, axis=-3)[..., body, :, :], np.stack(shifts, axis=-2)[..., body, :]
+    rotation, shift = rotations[..., body, :, :], shifts[..., body, :]
     start, end = (np.einsum("...cij,cj->...ci", rotation, points) + shift for points in (arm.start, arm.end))
     return start, end
+
+
+def body_poses(qpos: Array, parent: Array, axis: Array, anchor: Array) -> tuple[Array, Array]:
+    """Rotations [..., bodies, 3, 3] and shifts [..., bodies, 3] [m] of an arm's bodies from the zero pose.
+
+    The base comes first, then the body of each joint: a point p of the zero pose moves to rotation p + shift.
+
+    Args:
+      qpos: [..., joints] angles [rad].
+      parent, axis, anchor: of the joints, see `ClearanceConstants`.
+    """
+    batch, identity = qpos.shape[:-1], np.eye(3, dtype=axis.dtype)
+    rotations = [np.broadcast_to(identity, (*batch, 3, 3))]
+    shifts = [np.broadcast_to(0 * identity[0], (*batch, 3))]
+    angle, cross = qpos[..., None, None], np.cross(identity, axis[:, None])  # cross @ x: product of axis and x
+    turns = identity + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+    steps = anchor[..., None] - turns @ anchor[..., None]
+    for joint, before in enumerate(np.asarray(parent).tolist()):
+        rotation = rotations[before + 1]
+        shifts.append(shifts[before + 1] + (rotation @ steps[..., joint, :, :])[..., 0])
+        rotations.append(rotation @ turns[..., joint, :, :])
+    return np.stack(rotations, axis=-3), np.stack(shifts, axis=-2)
 
 
 def segment_distances(a: Array, b: Array, c: Array, d: Array, xp: Any, smoothing: float = 0.0) -> Array:

@@ -6,7 +6,8 @@ import mimic.base.quiet_mjx  # noqa: F401  # before brax
 import copy
 import dataclasses
 import functools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from mimic.base import compat, registry
 from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig
 from mimic.envs.start_poses import home_poses, nearest_poses
-from mimic.envs.terms import Transition, observation_layout_of_terms, observation_terms, observed, reward_terms
+from mimic.envs.terms import ObservationTerm, Transition, observation_terms, observed, reward_terms
 from mimic.metric.capsule_distances import changing_pairs
 from mimic.metric.distance import LinkDistance, Metric
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
@@ -450,46 +451,41 @@ def observed_parts(states: LinkStates) -> list[Array]:
 
 def observation_layout(expert: Embodiment, learner: Embodiment, preview: int) -> list[dict[str, Any]]:
     """The parts of an observation, in order: name, shape, unit, and the indices where they start and stop."""
-    layout = link_layout(expert, learner, preview)
-    start, joints = layout[-1]["stop"], learner.num_joints
-    for name, unit in (("sines of the angles", "1"), ("cosines of the angles", "1"), ("joint velocities", "rad/s")):
-        layout.append(
-            {"name": f"learner: {name}", "shape": [joints], "unit": unit, "start": start, "stop": start + joints}
-        )
-        start += joints
-    return layout
-
-
-def link_layout(expert: Embodiment, learner: Embodiment, preview: int) -> list[dict[str, Any]]:
-    """The parts of an observation that are link states, as in `observation_layout`."""
     observed = [("learner", learner), ("expert", expert)]
     observed += [(f"expert {ahead} steps ahead", expert) for ahead in range(1, preview + 1)]
-    layout, start = [], 0
+    parts = []
     for arm_name, arm in observed:
-        links, hands = arm.num_links, len(arm.hand_joint)
-        parts = [
-            ("position", links, "chain lengths"),
-            ("direction", links, "1"),
-            ("linear_velocity", links, "chain lengths/s"),
-            ("angular_velocity", links, "rad/s"),
-            ("hand x- and z-axes", 2 * hands, "1"),
-        ]
-        for name, rows, unit in parts[: 5 if hands else 4]:
-            stop = start + 3 * rows
-            shape = [rows, 3]
-            layout.append({"name": f"{arm_name}: {name}", "shape": shape, "unit": unit, "start": start, "stop": stop})
-            start = stop
+        of_links = ("position", "chain lengths"), ("direction", "1")
+        of_links += ("linear_velocity", "chain lengths/s"), ("angular_velocity", "rad/s")
+        parts += [(f"{arm_name}: {name}", [arm.num_links, 3], unit) for name, unit in of_links]
+        if arm.hand_joint:
+            parts.append((f"{arm_name}: hand x- and z-axes", [2 * len(arm.hand_joint), 3], "1"))
+    of_joints = ("sines of the angles", "1"), ("cosines of the angles", "1"), ("joint velocities", "rad/s")
+    parts += [(f"learner: {name}", [learner.num_joints], unit) for name, unit in of_joints]
+    return _laid_out(parts)
+
+
+def _laid_out(parts: Sequence[tuple[str, list[int], str]], start: int = 0) -> list[dict[str, Any]]:
+    """Parts of names, shapes and units that follow each other from an index on, as in `observation_layout`."""
+    layout = []
+    for name, shape, unit in parts:
+        stop = start + math.prod(shape)
+        layout.append({"name": name, "shape": shape, "unit": unit, "start": start, "stop": stop})
+        start = stop
     return layout
 
 
 def layout_of(env: ImitationEnv) -> list[dict[str, Any]]:
     """The parts of an environment's observation, as in `observation_layout`, with those of terms or of its class."""
     if env._has_own_observation:
-        size = env.observation_size
-        name = f"observation of {type(env).__name__}"
-        return [{"name": name, "shape": [size], "unit": "", "start": 0, "stop": size}]
+        return _laid_out([(f"observation of {type(env).__name__}", [env.observation_size], "")])
     layout = observation_layout(env.expert, env.learner, env.config.preview)
-    return layout + observation_layout_of_terms(env, layout[-1]["stop"])
+
+    def size(name: str, term: ObservationTerm) -> int:
+        return jax.eval_shape(lambda: observed(name, term, env, env.start(jax.random.PRNGKey(0)))).size
+
+    parts = [(f"term: {name}", [size(name, term)], "") for name, term in env.observation_terms]
+    return layout + _laid_out(parts, layout[-1]["stop"])
 
 
 def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple[Demonstrations, Demonstrations]:

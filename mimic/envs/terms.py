@@ -147,15 +147,3 @@ def observed(name: str, term: ObservationTerm, env: Env, state: ArmState) -> Flo
     if value.ndim != 1:
         raise ValueError(f"observation_term {name!r}: expected a vector, got shape {list(value.shape)}")
     return value
-
-
-def observation_layout_of_terms(env: Env, start: int) -> list[dict[str, Any]]:
-    """The parts of an observation that its terms add, from an index on, as in `observation_layout`."""
-    layout = []
-    for name, term in env.observation_terms:
-        size = jax.eval_shape(
-            lambda term=term, name=name: observed(name, term, env, env.start(jax.random.PRNGKey(0)))
-        ).size
-        layout.append({"name": f"term: {name}", "shape": [size], "unit": "", "start": start, "stop": start + size})
-        start += size
-    return layout

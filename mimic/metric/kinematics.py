@@ -349,7 +349,7 @@ def candidate_points(states: LinkStates) -> LinkStates:
 def body_twists(
     arm: Embodiment, qpos: Float[ArrayLike, "*#batch joints"], qvel: Float[ArrayLike, "*#batch joints"]
 ) -> Float[Array, "*batch links 6"]:
-    """Body twists [omega, v] of the link frames, by the recursion over adjoint maps (paper, eq. 7).
+    """Body twists [omega, v] of the link frames, V = T^-1 dT/dt (paper, eq. 7).
 
     Units: omega [rad/s] and v [m/s], both in the link's own frame.
 
@@ -361,33 +361,10 @@ def body_twists(
     Raises:
       ValueError: `qpos` or `qvel` is not [..., joints].
     """
-    motion = joint_values(arm, qpos, "qpos"), joint_values(arm, qvel, "qvel")
-    return over_batch(functools.partial(_twists, arm), *motion, axes=1)
-
-
-def _twists(arm: Embodiment, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"]) -> Float[Array, "links 6"]:
-    twists = [(spatial.ZERO, spatial.ZERO)]
-    for joint, parent in enumerate(arm.joint_parent):
-        omega, v = twists[parent + 1]
-        axis, anchor = spatial.vector(arm.joint_axis[joint]), spatial.vector(arm.joint_anchor[joint])
-        rotation = spatial.axis_rotation(axis, qpos[joint])
-        shift = spatial.subtract(anchor, spatial.rotate(rotation, anchor))  # exp(q S) = [rotation, shift]
-        omega, v = _inverse_adjoint(rotation, shift, omega, v)
-        omega = spatial.add(omega, spatial.scale(qvel[joint], axis))
-        v = spatial.add(v, spatial.scale(qvel[joint], spatial.cross(anchor, axis)))
-        twists.append((omega, v))
-    rows = []
-    for link, joint in enumerate(arm.link_joint):
-        rotation, position = spatial.rotation(arm.link_rotation[link]), spatial.vector(arm.link_position[link])
-        omega, v = _inverse_adjoint(rotation, position, *twists[joint + 1])
-        rows.append((*omega, *v))
-    return spatial.stack(rows, qpos.dtype)
-
-
-def _inverse_adjoint(rotation: Rotation, position: Vector, omega: Vector, v: Vector) -> tuple[Vector, Vector]:
-    """Ad of T^-1 on a twist, T = [rotation, position]."""
-    back = spatial.transpose(rotation)
-    return spatial.rotate(back, omega), spatial.rotate(back, spatial.add(v, spatial.cross(omega, position)))
+    rotations, states = forward_kinematics(arm, qpos).rotation, link_states(arm, qpos, qvel, normalized=False)
+    assert states.angular_velocity is not None
+    twists = [jnp.sum(rotations * x[..., None], axis=-2) for x in (states.angular_velocity, states.linear_velocity)]
+    return jnp.concatenate(twists, axis=-1)
 
 
 def joint_axes(arm: Embodiment, frames: Sequence[JointFrame]) -> list[Vector]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.control.clearance import ClearanceConstants, capsule_axes
+from mimic.arms.link_match import hand_poses
 from mimic.motions.formats.episodes import Motion
 
 VELOCITIES = "the velocities"
@@ -182,15 +182,8 @@ def _of_hand_steps(arm: Embodiment, samples: Samples, steps: np.ndarray) -> Evid
 
 def hand_points(arm: Embodiment, qpos: Float[np.ndarray, "*rows joints"]) -> tuple[np.ndarray, np.ndarray]:
     """Positions [*rows, 3] [m] and rotations [*rows, 3, 3] of an arm's only hand, by NumPy alone."""
-    origin, axes = np.asarray(arm.hand_position[0], float), np.asarray(arm.hand_rotation[0], float)
-    start, end = np.tile(origin, (3, 1)), origin + axes.T
-    nothing = np.zeros((0, 2), int)
-    points = ClearanceConstants(
-        np.array(arm.joint_parent), np.asarray(arm.joint_axis, float), np.asarray(arm.joint_anchor, float),
-        np.repeat(arm.hand_joint[0], 3), start, end, np.zeros(3), nothing, nothing[:, 0], 0.0,
-    )  # fmt: skip
-    starts, ends = capsule_axes(qpos, points)
-    return starts[..., 0, :], np.swapaxes(ends - starts, -1, -2)
+    poses = hand_poses(arm, qpos)[..., 0, :, :]
+    return poses[..., :3, 3], poses[..., :3, :3]
 
 
 def _rotations(vectors: np.ndarray) -> np.ndarray:

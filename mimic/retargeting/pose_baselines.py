@@ -13,6 +13,7 @@ from jaxtyping import Float
 from mimic.arms.embodiment import Embodiment, segment_arm
 from mimic.arms.pose_limits import pose_limits
 from mimic.metric.similarity import centre_line_table
+from mimic.retargeting.live_pose import joint_spec
 from mimic.retargeting.pose import checked_poses, shared_joints
 
 Poses = Float[np.ndarray, "*batch time joints"]
@@ -169,24 +170,14 @@ def kinematic_model(arm: Embodiment, sites: dict[str, int]) -> mujoco.MjModel:
       arm: the embodiment.
       sites: segment at whose end each site is, with its x-axis along the segment, by name.
     """
-    spec = mujoco.MjSpec()
-    spec.compiler.autolimits = False
-    spec.compiler.degree = False
-    unit = 1 / float(segment_arm(arm).chain_length)
-    bodies = [(spec.worldbody, np.zeros(3))]
-    lower, upper = pose_limits(arm, float)
-    anchors = unit * np.asarray(arm.joint_anchor)
-    for name, before, axis, anchor, low, high in zip(
-        arm.joint_names, arm.joint_parent, arm.joint_axis, anchors, lower, upper, strict=True
-    ):
-        parent, origin = bodies[before + 1]
-        body = parent.add_body(pos=anchor - origin, mass=1.0, inertia=np.ones(3), explicitinertial=True)
-        limited = bool(np.isfinite(low))
-        joint_range = [low, high] if limited else [0.0, 0.0]
-        body.add_joint(name=name, axis=axis, range=joint_range, limited=limited)
-        bodies.append((body, anchor))
+    unit = float(segment_arm(arm).chain_length)
+    spec, bodies = joint_spec(arm, unit)
+    for number, limit in enumerate(zip(*pose_limits(arm, float), strict=True)):
+        if np.all(np.isfinite(limit)):
+            joint = spec.joint(str(number))
+            joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, limit
     for name, segment in sites.items():
-        start, end = unit * np.asarray(arm.segment_start[segment]), unit * np.asarray(arm.segment_end[segment])
+        start, end = (np.asarray(points[segment]) / unit for points in (arm.segment_start, arm.segment_end))
         rotation = smallest_rotation(np.array([1.0, 0.0, 0.0]), (end - start) / np.linalg.norm(end - start))
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, rotation.ravel())

@@ -9,7 +9,7 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import load_mjcf, panda_path, segment_arm
-from mimic.metric.kinematics import body_twists, forward_kinematics, link_state_table, link_states
+from mimic.metric.kinematics import link_state_table, link_states
 from tests.helpers.trees import TORSO_TIPS, hand, largest_error, torso
 
 GENERATED = {
@@ -92,20 +92,6 @@ def test_locked_joints_of_a_tree_keep_the_link_states():
         strict=True,
     ):
         np.testing.assert_allclose(a, b, atol=1e-12)
-
-
-def test_body_twists_of_a_tree(x64):
-    arm = tree()
-    (qpos,), (qvel,) = poses(arm, 1)
-    rotations, states = (
-        np.asarray(forward_kinematics(arm, qpos).rotation),
-        link_states(arm, qpos, qvel, normalized=False),
-    )
-    expected = np.concatenate(
-        [np.einsum("lji,lj->li", rotations, np.asarray(x)) for x in (states.angular_velocity, states.linear_velocity)],
-        axis=1,
-    )
-    np.testing.assert_allclose(body_twists(arm, qpos, qvel), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(
