@@ -38,7 +38,6 @@ assert mesh.trimesh.Trimesh and jaxopt.projection
     "everything": """
 mimic.metric.distance, mimic.arms.arm, mimic.retargeting.pose, mimic.envs.config.EnvConfig, mimic.fit
 mimic.export_run, mimic.ImitationEnv
-import mimic.commands.view_any_arm
 """
     + "\n".join(f"import mimic.viewer.{name}" for name in SHOWN),
 }

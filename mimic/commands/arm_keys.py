@@ -15,7 +15,10 @@ from mimic.envs import env_config, environments
 ROLES = ("expert", "learner")
 _PREFIXES = {"train": "env.", "demonstrations": "env.", "retarget": "env.", "view": "env.", "inspect": ""}
 _TEMPLATE = "pair"  # the environment whose arms are the user's
-_OWN_ARMS = ("run", "mapper")  # keys of the command view that bring arms along
+_OWN_ARMS = {  # keys of the command view that bring an arm along
+    "expert": ("run", "mapper", "source"),
+    "learner": ("run",),
+}
 
 
 def expand_arms(arguments: Sequence[str], command: str) -> list[str]:
@@ -36,13 +39,8 @@ def expand_arms(arguments: Sequence[str], command: str) -> list[str]:
         if not equals or role not in ROLES:
             others.append(argument)
             continue
-        if command == "view" and {*_OWN_ARMS} & keys:
-            raise ValueError(
-                "expert, learner: expected neither with run= or mapper=, whose arms are used; "
-                "mapper=any_arm takes learners=[NAME,...]"
-            )
-        if command == "view" and role == "expert" and "source" in keys:
-            raise ValueError("expert: expected none with source=, whose person is the expert")
+        if command == "view" and (key := next((key for key in _OWN_ARMS[role] if key in keys), "")):
+            raise ValueError(f"{role}: expected none with {key}=, which brings its own")
         full = f"{_PREFIXES[command]}{role}"
         if not dot and value == _TEMPLATE and sum(other in (role, full) for other in keys) > 1:
             continue  # the pair's arm is the one that another key names

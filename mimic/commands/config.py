@@ -5,16 +5,12 @@ This module imports other configs only, so that `--help` stays fast.
 
 import dataclasses
 import math
-from pathlib import Path
 from typing import Any
 
 from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import LIMITS
-from mimic.arms.named_arms import BUILT_IN, is_arm_name
 from mimic.base.config import check_choice, check_unused
 from mimic.base.ranges import check_ranges, checkpoint_number, number, seed_number
-from mimic.commands.arm_keys import arm_of_environment
-from mimic.envs import environments
 from mimic.envs.config import EnvConfig
 from mimic.evaluation.labels import SPLITS
 from mimic.physics.world import PHYSICS
@@ -409,8 +405,6 @@ class RetargetConfig:
 
 
 _FOLLOWED = "free", "exact", "relative"
-_LEARNERS = "panda", "panda4dof", "panda3dof"  # to choose from in a view
-_MODEL_FILES = ".xml", ".urdf"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -420,9 +414,7 @@ class ViewConfig:
     Attributes:
       env: environment that defines the arms and the metric.
       mapper: pose mapper that moves the learner instead of the optimiser: a run directory, or the name of one that
-        comes with mimic, such as "any_arm". Its arms are used.
-      learners: with a pose mapper to any arm, the learners to choose from on the page: names of arms or environments,
-        or files. The first one is shown first. Default []: the one of its environment, panda, panda4dof and panda3dof.
+        comes with mimic, such as "any_arm". Its arms are used; the learner of `env` with one to any arm.
       run: run directory of a policy to play. Its arms and demonstrations are used.
       source: motion capture file of a person to play as the expert, or tcp://localhost:PORT, a socket of this machine
         that takes points as lines of JSON.
@@ -441,7 +433,6 @@ class ViewConfig:
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
     mapper: str = ""
-    learners: list[str] = dataclasses.field(default_factory=list)
     run: str = ""
     source: str = ""
     demonstrations: str = ""
@@ -461,8 +452,6 @@ class ViewConfig:
         check_choice("split", self.split, SPLITS)
         if self.run and self.mapper:
             raise ValueError(f"run, mapper: expected one of them, got {self.run!r} and {self.mapper!r}")
-        if self.learners and not self.mapper:
-            raise ValueError("learners: expected with mapper=, as in mapper=any_arm learners=[panda,ur5e.xml]")
         if self.source:
             check_unused(self, ("run", "mapper", "demonstrations"), "with source=, whose person is the expert")
         else:
@@ -479,30 +468,6 @@ class ViewConfig:
                 "base: expected same or [x,y,z,yaw] with hand=exact or relative; inspect base=auto finds one"
             )
 
-    def resolve_learners(self, own: ArmConfig) -> dict[str, ArmConfig]:
-        """The arms to choose from, by the name that the page shows.
-
-        Args:
-          own: learner of the environment of the mapper.
-
-        Raises:
-          ValueError: an arm does not exist, or two have the same name.
-        """
-        names = self.learners or list(_LEARNERS)
-        arms = {Path(name).stem if name.endswith(_MODEL_FILES) else name: _arm("learners", name) for name in names}
-        if len(arms) < len(names):
-            raise ValueError(f"learners: expected arms of different names, got {', '.join(names)}")
-        return arms if self.learners else {Path(own.model).stem: own, **arms}
-
 
 def _without_none(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
-
-
-def _arm(role: str, name: str) -> ArmConfig:
-    if name in environments():
-        return arm_of_environment(role.removesuffix("s"), name)
-    if name not in BUILT_IN and not is_arm_name(name) and not Path(name).expanduser().is_file():
-        valid = ", ".join(environments())
-        raise ValueError(f"{role}: expected panda, an MJCF file, or an environment ({valid}), got {name!r}")
-    return ArmConfig(model=name)

@@ -4,15 +4,15 @@ import contextlib
 import dataclasses
 import functools
 import importlib.util
+import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import jax
 from rich.console import Console
 
-from mimic.arms.arm import ArmConfig
 from mimic.base import compat
 from mimic.base.config import new_folder
 from mimic.base.distribution import install_command
@@ -28,6 +28,7 @@ from mimic.commands.view_capture import (
     wait_for_arm,
 )
 from mimic.commands.view_server import check_port, is_installed, serve
+from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.episodes import package_error
@@ -35,15 +36,17 @@ from mimic.motions.mocap.live_hand import LiveHand
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.run_config import policy_run
 from mimic.viewer.hand_following import HandSettings
+from mimic.viewer.history import RATE
 from mimic.viewer.live_session import LiveSession
 
 if TYPE_CHECKING:
     from mimic.trainers.pose_mapper.mapper import PoseMapper
+    from mimic.viewer.controls import ExpertControls
     from mimic.viewer.page import Page
     from mimic.viewer.playback import Playback
-    from mimic.viewer.tracking import Preset
 
 CAPTURE_RATE = 100.0  # frames per second of a captured person, at most
+_DEFAULT = "panda4dof"  # the environment in mimic/conf/view.yaml
 _NUMBERS_RATE = 15.0  # per second, of the numbers, chart and maps, which cost a browser more than the arms
 
 
@@ -79,14 +82,8 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     return _prepare_mapper(config)
 
 
-def _prepare_live(
-    config: ViewConfig,
-    env: EnvConfig,
-    session: LiveSession,
-    learners: Mapping[str, ArmConfig] | None = None,
-    presets: "Sequence[Preset]" = (),
-) -> Callable[[], int]:
-    """Prepares a view whose expert the user moves; `learners` as of `serve`, `presets` as of `LearnerControls`.
+def _prepare_live(config: ViewConfig, env: EnvConfig, session: LiveSession) -> Callable[[], int]:
+    """Prepares a view whose expert the user moves.
 
     Raises:
       ValueError: demonstrations that cannot be read or are another arm's.
@@ -96,16 +93,31 @@ def _prepare_live(
         demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
         demonstrations.check_fits(session.expert, demonstrations.dt, demonstrations.horizon)
 
-    def show_session(page: "Page", times: Iterator[float]) -> None:
-        from mimic.viewer.learner_controls import LearnerControls
-        from mimic.viewer.live_page import show_live
+    def expert() -> "ExpertControls":
         from mimic.viewer.manual_controls import ManualControls
 
-        expert = ManualControls(session, env, demonstrations)
-        show_live(page, times, session, env, expert, LearnerControls(session, page.starts, presets))
+        return ManualControls(session, env, demonstrations)
+
+    return lambda: _serve_session(config, env, session, expert)
+
+
+def _serve_session(
+    config: ViewConfig,
+    env: EnvConfig,
+    session: LiveSession,
+    expert: "Callable[[], ExpertControls]",
+    rate: float = RATE,
+    numbers_rate: float = math.inf,
+) -> int:
+    """Serves a session whose expert moves as its controls say; rates are of frames and of numbers [1/s]."""
+
+    def show_session(page: "Page", times: Iterator[float]) -> None:
+        from mimic.viewer.live_page import show_live
+
+        show_live(page, times, session, env, expert(), numbers_rate)
 
     after = functools.partial(_finish, config, session)
-    return lambda: serve(config, env, _title(config, env), show_session, None, after, learners=learners)
+    return serve(config, env, _title(config, env), show_session, None, after, rate)
 
 
 def _session(config: ViewConfig, env: EnvConfig) -> LiveSession:
@@ -128,27 +140,20 @@ def _finish(config: ViewConfig, session: LiveSession) -> None:
 
 
 def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
-    """Prepares a view whose learner a pose mapper moves.
+    """Prepares a view whose learner a pose mapper moves: its own one, or the config's if it takes any.
 
     Raises:
       ValueError: there is no such mapper, or a learner does not exist or does not fit it.
     """
-    from mimic.commands.view_any_arm import AnyLearnerFunctions, read_learners
-    from mimic.viewer.tracking import shown_preset
-
     mapper = _load_mapper(config)
-    env = mapper.env
-    if not mapper.takes_any_learner:
-        if config.learners:
-            raise ValueError(f"learners: expected none with mapper={config.mapper}, which has one learner")
-        return _prepare_live(config, env, LiveSession(env, mapper))
-    named = config.resolve_learners(env.learner)
-    learners, presets = read_learners(named, env.limits, env.metric.links)
-    env = dataclasses.replace(env, arms=None, learner=next(iter(named.values())))
-    names = [shown_preset(presets, index, {}).name for index in range(len(learners))]
-    session = LiveSession(env, any_arm=AnyLearnerFunctions(mapper, learners))
-    drawn = dict(zip(names, (learner.config for learner in learners), strict=True))
-    return _prepare_live(config, env, session, drawn, presets)
+    if mapper.takes_any_learner:
+        config.env.check_one_learner()
+        env = dataclasses.replace(mapper.env, arms=None, learner=config.env.learner)
+        mapper.to(env.learner)
+        return _prepare_live(config, env, LiveSession(env, lambda learner: mapper.to(learner).nearest))
+    if config.env.learner != env_config(_DEFAULT).learner:
+        raise ValueError(f"learner: expected none with mapper={config.mapper}, which has one learner")
+    return _prepare_live(config, mapper.env, LiveSession(mapper.env, lambda learner: mapper, can_lock=False))
 
 
 def _load_mapper(config: ViewConfig) -> "PoseMapper":
@@ -175,16 +180,7 @@ def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
 
     def show(expert: CapturedExpert) -> int:
         live = _session(config, expert.env)
-        after = functools.partial(_finish, config, live)
-
-        def show_session(page: "Page", times: Iterator[float]) -> None:
-            from mimic.viewer.learner_controls import LearnerControls
-            from mimic.viewer.live_page import show_live
-
-            learner = LearnerControls(live, page.starts)
-            show_live(page, times, live, expert.env, expert.controls(live), learner, _NUMBERS_RATE)
-
-        return serve(config, expert.env, _title(config, expert.env), show_session, None, after, rate=CAPTURE_RATE)
+        return _serve_session(config, expert.env, live, lambda: expert.controls(live), CAPTURE_RATE, _NUMBERS_RATE)
 
     if is_address(config.source):
         listener = listen(config)
@@ -239,7 +235,8 @@ def _play(page: "Page", times: Iterator[float], playback: "Playback", split: str
     for dt in times:
         if player.advance(dt):
             episode = player.split, player.demonstration
-            frame, chart = playback.frame(*episode, player.time), playback.chart(*episode, player.time)
+            time = player.timeline.time
+            frame, chart = playback.frame(*episode, time), playback.chart(*episode, time)
             page.show(frame, chart, playback.note(*episode))
 
 

@@ -7,7 +7,7 @@ import io
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from mimic.arms.arm import ArmConfig, build_arm
@@ -18,7 +18,7 @@ from mimic.viewer.history import RATE
 from mimic.viewer.origins import is_local
 
 if TYPE_CHECKING:
-    from mimic.viewer.page import LearnerShape, Page
+    from mimic.viewer.page import Page
 
 _MAX_STEP = 0.1  # s, maximum time step, so that arms do not jump after a pause of the process
 
@@ -55,12 +55,10 @@ def serve(
     before: Callable[[], None] | None = None,
     after: Callable[[], None] | None = None,
     rate: float = RATE,
-    learners: Mapping[str, ArmConfig] | None = None,
 ) -> int:
     """Serves a page until a signal, with a rate of frames [1/s].
 
-    Calls `before` before the server starts and `after` when it has ended. The page has the learners to choose from by
-    name; default None: the one of the environment.
+    Calls `before` before the server starts and `after` when it has ended.
     """
     from mimic.viewer.meshes import ArmShape
     from mimic.viewer.page import Page
@@ -78,11 +76,12 @@ def serve(
     with noted_signals(signals, "view: ending; repeat to stop immediately"):
         server = make_server(config.host, config.port)
         try:
-            learners = learners or {_name(env.learner, env): env.learner}
-            is_flat = all(arm.model == "planar" for arm in (env.expert, *learners.values()))
-            shapes = [_learner_shape(name, arm, env) for name, arm in learners.items()]
-            expert = ArmShape(env.expert, env.limits, shapes[0].match.expert_colours)
-            page = Page(server, (_name(env.expert, env), expert), shapes, title, is_flat)
+            free = build_arm(dataclasses.replace(env.learner, locked=()), env.limits)  # joints are locked in the view
+            match = env.metric.match_links(build_arm(env.expert, env.limits).embodiment, free.embodiment)
+            expert = _name(env.expert, env), ArmShape(env.expert, env.limits, match.expert_colours)
+            learner = _name(env.learner, env), ArmShape(env.learner, env.limits, match.learner_colours)
+            is_flat = env.expert.model == env.learner.model == "planar"
+            page = Page(server, expert, learner, match, title, is_flat)
             print(f"view: {address(config.host, server.get_port())}   (Ctrl-C ends it)", flush=True)
             show(page, ticks(signals, rate))
         finally:
@@ -96,15 +95,6 @@ def serve(
 
 def _name(arm: ArmConfig, env: EnvConfig) -> str:
     return build_arm(arm, env.limits).embodiment.name.partition("-")[0]
-
-
-def _learner_shape(name: str, learner: ArmConfig, env: EnvConfig) -> "LearnerShape":
-    from mimic.viewer.meshes import ArmShape
-    from mimic.viewer.page import LearnerShape
-
-    free = build_arm(dataclasses.replace(learner, locked=()), env.limits)  # joints are locked in the view
-    match = env.metric.match_links(build_arm(env.expert, env.limits).embodiment, free.embodiment)
-    return LearnerShape(name, ArmShape(learner, env.limits, match.learner_colours), match)
 
 
 def address(host: str, port: int) -> str:

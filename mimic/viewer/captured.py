@@ -2,7 +2,6 @@
 
 import bisect
 import dataclasses
-import math
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -14,6 +13,7 @@ from mimic.motions.mocap.ball_chain import ball_chain_motion
 from mimic.motions.mocap.link_motion import LinkMotion
 from mimic.motions.mocap.live_points import LiveArm
 from mimic.motions.mocap.point_socket import PointListener
+from mimic.viewer.timeline import Timeline
 
 SILENCE = 1.0  # s without a sample, after which the sender counts as stopped
 PAUSE = 1.0  # s; after a longer one, the next pose may be anywhere
@@ -76,35 +76,19 @@ class ClipPlayer:
     """Plays a clip.
 
     Attributes:
-      time: since the start of the clip [s].
-      is_playing: whether time goes on.
-      repeats: whether it starts again at its end.
+      clip: the clip.
+      timeline: its time.
     """
 
     def __init__(self, clip: Clip):
-        self.clip = clip
-        self.time, self.is_playing, self.repeats = 0.0, True, True
-        self._jumped = self._changed = True
+        self.clip, self.timeline = clip, Timeline(clip.duration)
 
     def advance(self, dt: float) -> tuple[np.ndarray | None, bool]:
         """Advances by a time step [s]; returns the pose, None where it has not changed, and whether it jumped."""
-        before = self.clip.part(self.time)
-        if self.is_playing:
-            self._changed = True
-            if self.time >= self.clip.duration:
-                self.is_playing = self.repeats
-                self.go_to(0.0 if self.repeats else self.clip.duration)
-            else:
-                self.time = min(self.time + dt, self.clip.duration)
-        jumped = self._jumped or self.clip.part(self.time) != before
-        changed, self._changed, self._jumped = self._changed, False, False
-        return (self.clip.pose(self.time), jumped) if changed else (None, False)
-
-    def go_to(self, time: float) -> None:
-        """Continues at another time [s]; NaN is dropped."""
-        if math.isfinite(time):
-            self.time = float(np.clip(time, 0, self.clip.duration))
-            self._jumped = self._changed = True
+        before = self.clip.part(self.timeline.time)
+        changed, jumped = self.timeline.advance(dt)
+        time = self.timeline.time
+        return (self.clip.pose(time), jumped or self.clip.part(time) != before) if changed else (None, False)
 
 
 class Said:

@@ -1,4 +1,4 @@
-"""The controls of a live view: those of the expert, of the metric, of the learner and of its hand, each in a tab."""
+"""The controls of a live view: expert, metric, the learner's locks and its hand, each in a tab."""
 
 from typing import Protocol
 
@@ -7,7 +7,6 @@ import viser
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import CORRESPONDENCES
 from mimic.viewer.hand_controls import HandControls
-from mimic.viewer.learner_controls import LearnerControls
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.manual_controls import by_user
 
@@ -35,43 +34,53 @@ class LiveControls:
       session: session that the widgets control.
       env: environment that defines the metric.
       expert: controls of the expert.
-      learner: controls of the learner.
     """
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        session: LiveSession,
-        env: EnvConfig,
-        expert: ExpertControls,
-        learner: LearnerControls,
-    ):
+    def __init__(self, server: viser.ViserServer, session: LiveSession, env: EnvConfig, expert: ExpertControls):
         self._server, self._session, self._env = server, session, env
-        self._learner, self._hand = learner, HandControls(session) if session.by_optimiser else None
+        self._hand = HandControls(session) if session.by_optimiser else None
         tabs = server.gui.add_tab_group()
         with tabs.add_tab("Expert"):
             expert.add_widgets(server)
         with tabs.add_tab("Metric"):
             self._add_metric()
         with tabs.add_tab("Learner"):
-            learner.add_widgets(server)
+            self._add_locks()
         if self._hand is not None:
             with tabs.add_tab("Hand"):
                 self._hand.add_widgets(server)
 
     def update(self) -> None:
         """Shows the settings of the session, after one that was not possible."""
-        self._learner.update()
+        self._show_locks()
         if self._hand is not None:
             self._hand.update()
 
+    def _add_locks(self) -> None:
+        gui, session = self._server.gui, self._session
+        self._locks = {
+            name: gui.add_checkbox(f"lock {name}", False, disabled=not session.can_lock) for name in session.joints
+        }
+        for name, box in self._locks.items():
+            box.on_update(by_user(lambda value, name=name: self._lock(name, value)))
+        self._note = gui.add_markdown("", visible=session.can_lock)
+        self._show_locks()
+
+    def _lock(self, name: str, is_locked: bool) -> None:
+        self._session.lock(name, is_locked)
+        self._show_locks()
+
+    def _show_locks(self) -> None:
+        locked = self._session.settings.locked
+        for name, box in self._locks.items():
+            box.value = name in locked
+        angles = ", ".join(f"{name} at {locked[name]:z.2f} rad" for name in self._locks if name in locked)
+        self._note.content = f"Locked: {angles}." if angles else "A joint is locked at its angle in the start pose."
+
     def _add_metric(self) -> None:
         gui, session, settings = self._server.gui, self._session, self._session.settings
-        others = () if session.takes_any_arm else CORRESPONDENCES
-        choices = tuple(dict.fromkeys((*others, settings.correspondence)))  # a run may have one of its own
-        correspondence = gui.add_dropdown(
-            "correspondence", choices, initial_value=settings.correspondence, disabled=len(choices) == 1
-        )
+        choices = tuple(dict.fromkeys((*CORRESPONDENCES, settings.correspondence)))  # a run may have one of its own
+        correspondence = gui.add_dropdown("correspondence", choices, initial_value=settings.correspondence)
         correspondence.on_update(by_user(lambda value: session.change(correspondence=value)))
         for term in ("rotation", "translation"):
             initial = getattr(settings, term)
@@ -81,5 +90,4 @@ class LiveControls:
                 hint="weight of this term of the distance",
             )  # fmt: skip
             weight.on_update(by_user(lambda value, term=term: session.change(**{term: float(value)})))
-        if not session.takes_any_arm:
-            gui.add_markdown("A new correspondence, and a first weight on translation, take some seconds to compile.")
+        gui.add_markdown("A new correspondence, and a first weight on translation, take some seconds to compile.")

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from mimic.envs.config import EnvConfig
 from mimic.viewer.controls import ExpertControls, LiveControls
 from mimic.viewer.history import History
-from mimic.viewer.learner_controls import LearnerControls
 from mimic.viewer.live_session import Frame, LiveSession
 from mimic.viewer.page import Page
 
@@ -19,11 +18,10 @@ def show_live(
     live: LiveSession,
     env: EnvConfig,
     expert: ExpertControls,
-    learner: LearnerControls,
     numbers_rate: float = math.inf,
 ) -> None:
     """Moves the arms at each tick, and shows numbers, chart and maps at a rate [1/s]."""
-    controls = LiveControls(page.server, live, env, expert, learner)
+    controls = LiveControls(page.server, live, env, expert)
     history, frame, was_compiling, since_numbers = History(), None, True, 0.0
     is_behind = False  # whether the numbers are older than the arms
     for dt in times:

@@ -17,8 +17,7 @@ from mimic.viewer.hand_following import FREE, HandDrag, HandFollower, HandFrame,
 from mimic.viewer.tracking import (
     CompiledFunctions,
     FunctionCache,
-    FunctionSource,
-    Mapper,
+    MapperOf,
     PoseComparison,
     Settings,
     home_angles,
@@ -47,7 +46,6 @@ class Frame:
       matrix: correspondence matrix W.
       links: weighted distance D' of every pair of links.
       similarity: measures of `mimic.metric.similarity` by name.
-      arm: index of the learner among the arms that can be chosen.
       hand: of a learner whose hand follows the expert's.
     """
 
@@ -61,7 +59,6 @@ class Frame:
     matrix: Float[np.ndarray, "expert learner"]
     links: Float[np.ndarray, "expert learner"]
     similarity: Mapping[str, float]
-    arm: int = 0
     hand: HandFrame | None = None
 
 
@@ -71,8 +68,7 @@ class LiveSession:
     Args:
       env: environment that defines the arms and the metric.
       mapper: pose mapper that moves the learner instead of the optimiser.
-      any_arm: functions of a pose mapper to any arm; with these, the learner can be changed, and a joint is locked
-        where it is instead of at its angle in the start pose.
+      can_lock: whether the learner's joints can be locked and freed.
       hand: how the learner's hand follows, at the start.
       is_recorded: whether what the hand drives is kept.
 
@@ -81,7 +77,7 @@ class LiveSession:
       settings: requested settings; they take effect as soon as their functions are compiled.
       hand: how the learner's hand follows, with the optimiser.
       by_optimiser: whether the optimiser moves the learner, not a pose mapper.
-      takes_any_arm: whether the learner can be changed.
+      can_lock: whether the learner's joints can be locked and freed.
 
     Raises:
       ValueError: an arm is invalid.
@@ -90,17 +86,17 @@ class LiveSession:
     def __init__(
         self,
         env: EnvConfig,
-        mapper: Mapper | None = None,
-        any_arm: FunctionSource | None = None,
+        mapper: MapperOf | None = None,
+        can_lock: bool = True,
         hand: HandSettings | None = None,
         is_recorded: bool = False,
     ):
         self.hand: HandSettings = hand or HandSettings()
         self.expert: Embodiment = build_arm(env.expert, env.limits, env.metric.links).embodiment
         self.settings: Settings = initial_settings(env)
-        self.by_optimiser, self.takes_any_arm = mapper is None and any_arm is None, any_arm is not None
-        self._functions: FunctionSource = any_arm or FunctionCache(env, mapper)
-        self._lock_angles = None if self.takes_any_arm else lock_angles(env)  # None: a joint is locked where it is
+        self.by_optimiser, self.can_lock = mapper is None, can_lock
+        self._functions = FunctionCache(env, mapper)
+        self._lock_angles = lock_angles(env)
         self._lock = threading.RLock()
         self._angles = {**home_angles(env), **self.settings.locked}  # of all joints of the learner [rad]
         self._pose = np.array(self.expert.home, np.float32)
@@ -114,6 +110,11 @@ class LiveSession:
         self._gripper: float | None = None  # opening of the expert's
         self._active = self.settings  # the last settings with compiled functions
         self._rest_key: Any = None  # request for which the learner is at rest
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the learner's joints, base to tip, including those that are locked."""
+        return tuple(self._lock_angles)
 
     @property
     def pose(self) -> Float[np.ndarray, " joints"]:
@@ -200,16 +201,8 @@ class LiveSession:
     def lock(self, joint: str, is_locked: bool) -> None:
         """Locks a joint of the learner, or frees it."""
         with self._lock:
-            angle = (self._lock_angles or self._angles)[joint]
             others = {name: at for name, at in self.settings.locked.items() if name != joint}
-            self.change(locked={**others, joint: angle} if is_locked else others)
-
-    def choose(self, arm: int, locked: Mapping[str, float], start: Mapping[str, float]) -> None:
-        """Changes the learner and its locks [rad]; another arm starts in the pose `start` with these locks."""
-        with self._lock:
-            if arm != self.settings.arm:
-                self._angles = {**start, **locked}
-            self.change(arm=arm, locked=locked)
+            self.change(locked={**others, joint: self._lock_angles[joint]} if is_locked else others)
 
     @property
     def is_compiling(self) -> bool:
@@ -308,7 +301,6 @@ class LiveSession:
             matrix=np.asarray(comparison.matrix),
             links=np.asarray(comparison.links),
             similarity={name: float(value) for name, value in comparison.similarity.items()},
-            arm=self._active.arm,
             hand=hand,
         )
 

@@ -1,13 +1,12 @@
 """The page of every view in viser: two arms in 3-D, numbers, heat maps and a chart."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import viser
 from jaxtyping import Float
 
-from mimic.arms.embodiment import Embodiment
 from mimic.arms.link_match import LinkMatch
 from mimic.viewer import html
 from mimic.viewer.hand_following import HandFrame
@@ -18,25 +17,11 @@ _GRID = 0.1, 0.5  # m, sizes of a cell and of a section
 _STANCE = np.array([2.5, -0.1, 0.75])  # camera position relative to its target, in arm lengths
 _FROM_ABOVE = np.array([0.55, -0.01, 2.9])
 _FIELD_OF_VIEW = 0.75  # rad, vertical
-EXPERT_BASE = "/expert/base"  # base frame of the expert
+EXPERT_BASE, _LEARNER = "/expert/base", "/learner"  # base frame of the expert, and frame of the learner
 _GOAL_SIZE, _GOAL_BALL = 0.12, 0.035  # axes of a goal of the hand, and the ball in it, in chain lengths
 _STATE_COLOURS = {"tracking": (60, 170, 80), "nearest": (215, 40, 40)}  # of the ball by the state of a hand
 _OTHER_STATE = (240, 160, 30)
 _PANEL_WIDTH = 384.0  # pixels; the heat maps of two arms with seven joints fit
-
-
-class LearnerShape(NamedTuple):
-    """A learner that a page can show.
-
-    Attributes:
-      name: of the arm.
-      shape: its meshes.
-      match: which links of the expert and of this arm correspond.
-    """
-
-    name: str
-    shape: ArmShape
-    match: LinkMatch
 
 
 class Page:
@@ -44,37 +29,32 @@ class Page:
 
     Args:
       server: new server without elements.
-      expert: name and meshes of the expert.
-      learners: learners to choose from, see `Frame.arm`.
+      expert, learner: name and meshes of each.
+      match: which of their links correspond.
       title: title of the page.
       is_flat: whether the camera looks from above.
 
     Attributes:
       server: the server.
-      expert: meshes of the expert.
-      starts: start pose of each learner, all joints by name [rad].
     """
 
     def __init__(
         self,
         server: viser.ViserServer,
         expert: tuple[str, ArmShape],
-        learners: Sequence[LearnerShape],
+        learner: tuple[str, ArmShape],
+        match: LinkMatch,
         title: str,
         is_flat: bool,
     ):
-        self.server, self.expert = server, expert[1]
-        self.starts = [_start(learner.match.learner) for learner in learners]
-        largest = max((learner.shape for learner in learners), key=lambda shape: shape.reach)
-        reach = max(self.expert.reach, largest.reach)
-        _set_stage(server, reach, is_flat)
-        (left, right), label_at = places([self.expert, largest]), -0.3 if is_flat else 0.3
-        self._expert = _DrawnArm(server, "/expert", self.expert, left, f"expert: {expert[0]}", label_at)
-        _add_base(server, EXPERT_BASE, self.expert)
-        self._learners = [
-            _DrawnLearner(server, f"/learner{index}", learner, right, label_at)
-            for index, learner in enumerate(learners)
-        ]
+        self.server, shapes = server, (expert[1], learner[1])
+        _set_stage(server, max(shape.reach for shape in shapes), is_flat)
+        (left, right), label_at = places(shapes), -0.3 if is_flat else 0.3
+        self._expert = _DrawnArm(server, "/expert", shapes[0], left, f"expert: {expert[0]}", label_at)
+        _add_base(server, EXPERT_BASE, shapes[0])
+        self._learner = _DrawnArm(server, _LEARNER, shapes[1], right, f"learner: {learner[0]}", label_at)
+        self._ghost = _Ghost(server, shapes[1], match)
+        self._goals = _HandGoals(server, shapes[1], len(match.learner.hand_joint))
         self._title = html.title(title)
         self._numbers = server.gui.add_html("")
         self.show_note("compiling …")
@@ -102,27 +82,20 @@ class Page:
 
     def _move(self, frame: Frame) -> None:
         self._expert.move_to(frame.expert, ())
-        for index, learner in enumerate(self._learners):
-            learner.show(frame, index == frame.arm)
-
-
-def _start(arm: Embodiment) -> Mapping[str, float]:
-    return dict(zip(arm.joint_names, map(float, arm.home), strict=True))
+        self._learner.move_to(frame.learner, frame.locked)
+        self._ghost.show(frame)
+        self._goals.show(frame.hand)
 
 
 class _DrawnArm:
-    """The meshes of an arm in the scene.
-
-    Attributes:
-      root: frame that contains everything.
-    """
+    """The meshes of an arm in the scene."""
 
     def __init__(
         self, server: viser.ViserServer, path: str, shape: ArmShape, place: np.ndarray, label: str, label_at: float
     ):
         self._shape = shape
         scene = server.scene
-        self.root = scene.add_frame(path, show_axes=False, position=place)
+        scene.add_frame(path, show_axes=False, position=place)
         place_of_label = (label_at * shape.reach, 0.0, 0.0)
         scene.add_label(f"{path}/label", label, position=place_of_label, anchor="top-center", font_screen_scale=1.1)
         bodies = sorted({part.body for part in shape.parts})
@@ -148,33 +121,15 @@ class _DrawnArm:
                 mark.visible = name in locked
 
 
-class _DrawnLearner:
-    """The meshes of a learner in the scene, and the expert over it."""
-
-    def __init__(self, server: viser.ViserServer, path: str, learner: LearnerShape, place: np.ndarray, label_at: float):
-        self._arm = _DrawnArm(server, path, learner.shape, place, f"learner: {learner.name}", label_at)
-        self._ghost = _Ghost(server, path, learner.shape, learner.match)
-        self._goals = _HandGoals(server, path, learner.shape, len(learner.match.learner.hand_joint))
-
-    def show(self, frame: Frame, is_chosen: bool) -> None:
-        """Shows the learner in a frame, or hides it."""
-        if self._arm.root.visible != is_chosen:
-            self._arm.root.visible = is_chosen
-        if is_chosen:
-            self._arm.move_to(frame.learner, frame.locked)
-            self._ghost.show(frame)
-            self._goals.show(frame.hand)
-
-
 class _Ghost:
     """The expert, translucent and scaled, at the learner, with lines between corresponding links.
 
     The learner's links keep their number while its joints are locked, so that the lines stay where they are.
     """
 
-    def __init__(self, server: viser.ViserServer, learner: str, shape: ArmShape, match: LinkMatch):
+    def __init__(self, server: viser.ViserServer, shape: ArmShape, match: LinkMatch):
         self._match = match
-        scene, path = server.scene, f"{learner}/ghost"
+        scene, path = server.scene, f"{_LEARNER}/ghost"
         self._root = _add_base(server, path, shape)
         at_rest = match.ghost(np.zeros(match.expert.num_joints), np.zeros(match.learner.num_joints))
         self._num_links = match.expert.num_links
@@ -207,8 +162,8 @@ class _Ghost:
 class _HandGoals:
     """Axes where the learner's hands should be, each with a ball whose colour is the state of the hand."""
 
-    def __init__(self, server: viser.ViserServer, learner: str, shape: ArmShape, count: int):
-        scene, path = server.scene, f"{learner}/goals"
+    def __init__(self, server: viser.ViserServer, shape: ArmShape, count: int):
+        scene, path = server.scene, f"{_LEARNER}/goals"
         _add_base(server, path, shape)
         size, ball = _GOAL_SIZE * shape.reach, _GOAL_BALL * shape.reach
         names = [f"{path}/{hand}" for hand in range(count)]

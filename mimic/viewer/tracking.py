@@ -4,14 +4,14 @@ import dataclasses
 import functools
 import math
 import threading
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from mimic.arms.arm import Arm, build_arm
+from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints
 from mimic.base import registry
@@ -21,7 +21,7 @@ from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line, similarity
 from mimic.retargeting.pose import imitate_pose, wrap_angles
 
-Mapper = Callable[[Array], Array]  # pose of the expert -> pose of the learner
+MapperOf = Callable[[ArmConfig], Callable[[Array], Array]]  # learner -> (pose of the expert -> pose of the learner)
 
 _MAX_COMPILED = 16  # sets of functions that are kept; each takes some MB
 _TRACKING_ITERATIONS = 8  # Newton steps from the current pose, which is close: sliders move in small steps
@@ -35,14 +35,12 @@ class Settings:
       locked: angle of each locked joint of the learner by name [rad].
       correspondence: see `MetricConfig`.
       translation, rotation: weights of the metric.
-      arm: index of the learner among the arms that can be chosen.
     """
 
     locked: Mapping[str, float]
     correspondence: str
     translation: float
     rotation: float
-    arm: int = 0
 
     def __post_init__(self) -> None:
         registry.check("correspondence", self.correspondence, "correspondence")
@@ -65,26 +63,6 @@ def initial_settings(env: EnvConfig) -> Settings:
     """The settings of an environment."""
     metric, locked = env.metric, build_arm(env.learner, env.limits).locked
     return Settings(locked, metric.correspondence, metric.translation, metric.rotation)
-
-
-class Preset(NamedTuple):
-    """A choice of a learner on the page.
-
-    Attributes:
-      name: as shown.
-      arm: index of the arm.
-      locked: angles of its locked joints [rad].
-    """
-
-    name: str
-    arm: int
-    locked: Mapping[str, float]
-
-
-def shown_preset(presets: Sequence[Preset], arm: int, locked: Mapping[str, float]) -> Preset:
-    """The preset of these locks, or else that of the arm without locks."""
-    of_arm = [preset for preset in presets if preset.arm == arm]
-    return next((preset for preset in of_arm if preset.locked == locked), [p for p in of_arm if not p.locked][0])
 
 
 class PoseComparison(NamedTuple):
@@ -127,7 +105,11 @@ def learner_arm(env: EnvConfig, locked: Mapping[str, float]) -> Arm:
     Raises:
       ValueError: a joint is unknown, or no joint is free.
     """
-    return build_arm(dataclasses.replace(env.learner, locked=dict(locked)), env.limits, env.metric.links)
+    return build_arm(_with_locks(env, locked), env.limits, env.metric.links)
+
+
+def _with_locks(env: EnvConfig, locked: Mapping[str, float]) -> ArmConfig:
+    return dataclasses.replace(env.learner, locked=dict(locked))
 
 
 def home_angles(env: EnvConfig) -> Mapping[str, float]:
@@ -141,7 +123,9 @@ def lock_angles(env: EnvConfig) -> Mapping[str, float]:
     return {**home_angles(env), **build_arm(env.learner, env.limits).locked}
 
 
-def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None = None) -> Iterator[CompiledFunctions]:
+def compile_functions(
+    env: EnvConfig, settings: Settings, mapper: MapperOf | None = None
+) -> Iterator[CompiledFunctions]:
     """Compiles the functions, which takes seconds; yields them first without `best`, then with it.
 
     Args:
@@ -156,10 +140,11 @@ def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None 
     arm = learner_arm(env, settings.locked)
     learner = arm.embodiment
     metric = _metric_of_weights(env, settings, expert, learner)
+    mapped = None if mapper is None else mapper(_with_locks(env, settings.locked))
 
     def track(qpos: Array, current: Array, weights: Array) -> Array:
-        if mapper is not None:
-            return mapper(qpos)
+        if mapped is not None:
+            return mapped(qpos)
         options = {"warm_start": current, "iterations": _TRACKING_ITERATIONS, **metric(weights).arguments}
         return imitate_pose(expert, learner, qpos, **options).qpos
 
@@ -176,9 +161,9 @@ def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None 
 
     q, q_hat = (jax.ShapeDtypeStruct((n.num_joints,), np.float32) for n in (expert, learner))
     w = jax.ShapeDtypeStruct((2,), np.float32)
-    functions = CompiledFunctions(arm, compiled(track, q, q_hat, w), compiled(compare, q, q_hat, w), None)
+    functions = CompiledFunctions(arm, _compiled(track, q, q_hat, w), _compiled(compare, q, q_hat, w), None)
     yield functions
-    yield dataclasses.replace(functions, best=compiled(best, q, w))
+    yield dataclasses.replace(functions, best=_compiled(best, q, w))
 
 
 def _metric_of_weights(
@@ -197,33 +182,15 @@ def _metric_of_weights(
     return metric
 
 
-def compiled(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
+def _compiled(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
     """The function, compiled for arguments of these shapes; it never compiles again."""
     return jax.jit(function).lower(*shapes).compile()
-
-
-class FunctionSource(Protocol):
-    """Functions that move the learner, by settings; see `FunctionCache`."""
-
-    def get(self, settings: Settings) -> CompiledFunctions | None:
-        """The functions; None until those that move the learner are compiled."""
-
-    def is_complete(self, settings: Settings) -> bool:
-        """Whether all functions are compiled, or their compilation has failed."""
-        ...
-
-    def wait(self, settings: Settings) -> CompiledFunctions:
-        """Waits for all functions and returns them."""
-        ...
-
-    def finish(self) -> None:
-        """Waits for a running compilation: a process must not end during it."""
 
 
 class FunctionCache:
     """Compiled functions by settings, compiled in a background thread, one set at a time."""
 
-    def __init__(self, env: EnvConfig, mapper: Mapper | None = None):
+    def __init__(self, env: EnvConfig, mapper: MapperOf | None = None):
         self._compile = functools.partial(compile_functions, env, mapper=mapper)
         self._results: dict[Any, CompiledFunctions | Exception] = {}
         self._thread: threading.Thread | None = None

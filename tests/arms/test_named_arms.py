@@ -5,7 +5,6 @@ import pytest
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.named_arms import MENAGERIE, named_arms
-from mimic.commands.config import ViewConfig
 from tests.arms.test_start_pose import ARM
 
 
@@ -45,7 +44,6 @@ def test_each_place_has_arms_by_name(place, places):
     config = mimic.env_config("pair", learner="toy7").learner
     assert config.model == str(file)
     assert build_arm(config).embodiment.joint_names == ("a", "b", "c")
-    assert ViewConfig(mapper="any_arm", learners=["toy7"]).resolve_learners(config)["toy7"].model == str(file)
 
 
 def test_the_first_place_is_used(places):

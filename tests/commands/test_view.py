@@ -13,7 +13,7 @@ import time
 import numpy as np
 import pytest
 
-from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.arm import build_arm
 from mimic.commands import view, view_capture, view_server
 from mimic.commands.capture import fixed_fraction
 from mimic.commands.config import ViewConfig
@@ -32,12 +32,10 @@ from tests.helpers.bodies import bvh_text, person
         (["learner=missing.xml"], "no MJCF or URDF file at"),
         (["mapper=missing"], "not a run directory"),
         (["run=a", "mapper=b"], "expected one of them"),
-        (["learners=[panda]"], "learners: expected with mapper=, as in mapper=any_arm learners=[panda,ur5e.xml]"),
-        (["mapper=planar4dof", "learners=[panda]"], "learners: expected none with mapper=planar4dof, which has one"),
+        (["mapper=any_arm", "expert=panda"], "expert: expected none with mapper=, which brings its own"),
+        (["mapper=planar4dof", "learner=panda"], "learner: expected none with mapper=planar4dof, which has one"),
         (["mapper=any_arm", "checkpoint=5"], "checkpoint: expected none with mapper=any_arm, which comes with mimic"),
-        (["mapper=any_arm", "learners=[a.xml]"], "learners: expected panda, an MJCF file, or an environment (any_arm,"),
-        (["mapper=any_arm", "learners=[panda,panda]"], "learners: expected arms of different names, got panda, panda"),
-        (["mapper=any_arm", "learners=[bimanual]"], "expected a serial arm, got a tree of 2 chains"),
+        (["mapper=any_arm", "learner=bimanual"], "expected a serial arm, got a tree of 2 chains"),
         (["hand=near"], "hand: expected one of free, exact, relative, got 'near'"),
         (["hand=exact", "mapper=any_arm"], "hand: expected none with run= or mapper=, which move the"),
         (["base=[0,0,0,1]"], "base: expected same or [x,y,z,yaw] with hand=exact or relative"),
@@ -73,15 +71,6 @@ def test_the_extra_is_named_where_viser_is_missing(reason, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "viser" else find(name, *more))
     assert "pip install 'mimic-arms[view]'" in reason("view")
-
-
-def test_a_mapper_to_any_arm_has_its_own_learner_and_the_pandas_to_choose_from():
-    default = ViewConfig(mapper="any_arm")
-    assert list(default.resolve_learners(ArmConfig())) == ["panda", "panda4dof", "panda3dof"]
-    planar = ArmConfig(model="planar", link_lengths=[0.3, 0.3])
-    assert next(iter(default.resolve_learners(planar).items())) == ("planar", planar)
-    named = ViewConfig(mapper="any_arm", learners=["panda3dof"]).resolve_learners(planar)
-    assert list(named) == ["panda3dof"] and named["panda3dof"].locked
 
 
 @pytest.mark.parametrize(

@@ -51,20 +51,20 @@ def test_a_player_plays_and_says_where_it_jumps(clip):
 def test_a_paused_player_computes_nothing(clip):
     player = ClipPlayer(clip)
     player.advance(0.1)
-    player.is_playing = False
+    player.timeline.is_playing = False
     assert player.advance(0.1) == (None, False)
-    player.go_to(1.0625)
+    player.timeline.go_to(1.0625)
     pose, jumped = player.advance(0.1)
     assert pose is not None and pose[0] == pytest.approx(5.5) and jumped
-    player.go_to(float("nan"))
+    player.timeline.go_to(float("nan"))
     assert player.advance(0.1) == (None, False)
 
 
 def test_a_player_that_does_not_repeat_ends_at_the_last_pose(clip):
     player = ClipPlayer(clip)
-    player.repeats = False
+    player.timeline.repeats = False
     last = [pose for pose, _ in (player.advance(0.3) for _ in range(10)) if pose is not None][-1]
-    assert last[0] == pytest.approx(6.0) and not player.is_playing
+    assert last[0] == pytest.approx(6.0) and not player.timeline.is_playing
 
 
 class Listener:

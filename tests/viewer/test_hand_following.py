@@ -173,11 +173,11 @@ def test_the_page_has_a_handle_a_tab_and_goals(env):
             hand = HandFrame(np.full((count, 3), 0.2), np.tile(np.eye(3), (count, 1, 1)), status)
             frame = Frame(angles[0], angles[1], (), (), (), 0.1, 0.1, np.eye(1), np.eye(1), {}, hand=hand)
             page.move(frame)
-            goals = page._learners[0]._goals
-            assert goals._axes[0].visible == is_shown and not page._learners[0]._ghost._root.visible
+            goals = page._goals
+            assert goals._axes[0].visible == is_shown and not page._ghost._root.visible
             done.append(tuple(goals._balls[0].color))
         page.move(dataclasses.replace(frame, hand=None))
-        assert page._learners[0]._ghost._root.visible and not goals._axes[0].visible
+        assert page._ghost._root.visible and not goals._axes[0].visible
 
     assert view_server.serve(config, env, "arms", show) == 0
     assert done[0] != done[1]

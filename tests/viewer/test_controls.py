@@ -1,0 +1,40 @@
+"""The controls of a live view on a page: which joints are locked, and what is drawn of it."""
+
+import importlib.util
+import socket
+
+import numpy as np
+import pytest
+
+if importlib.util.find_spec("viser") is None:
+    pytest.skip("needs viser: pip install 'mimic-arms[view]'", allow_module_level=True)
+
+from mimic.commands import view_server
+from mimic.commands.config import ViewConfig
+from mimic.envs import env_config
+from mimic.viewer.controls import LiveControls
+from mimic.viewer.live_session import Frame, LiveSession
+from mimic.viewer.manual_controls import ManualControls
+
+
+def test_locked_joints_are_checked_named_and_marked():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        config = ViewConfig(env=env_config("panda4dof"), port=probe.getsockname()[1])
+    done = []
+
+    def show(page, times):
+        session = LiveSession(config.env)
+        controls = LiveControls(page.server, session, config.env, ManualControls(session, config.env))
+        checked = [name for name, box in controls._locks.items() if box.value]
+        assert len(controls._locks) == 7 and checked == ["joint3", "joint6", "joint7"]
+        controls._lock("joint3", False)
+        assert not controls._locks["joint3"].value
+        assert controls._note.content == "Locked: joint6 at 0.00 rad, joint7 at 0.00 rad."
+        angles = dict.fromkeys(session.joints, 0.1)
+        for locked in ((), ("joint4",)):
+            page.move(Frame(angles, angles, locked, (), (), 0.1, 0.1, np.eye(1), np.eye(1), {}))
+            assert {name for name, mark in page._learner._marks.items() if mark.visible} == set(locked)
+        done.append(True)
+
+    assert view_server.serve(config, config.env, "arms", show) == 0 and done
