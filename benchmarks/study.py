@@ -9,7 +9,6 @@ contains is not repeated, so that an interrupted study can be continued. Prints 
 """
 
 import csv
-import itertools
 import json
 import os
 import sys
@@ -31,11 +30,11 @@ from mimic.base.overrides import setting
 from mimic.commands.collect.collect import prepare_collection
 from mimic.commands.collect.finished_runs import find_runs
 from mimic.commands.config import CollectConfig
-from mimic.motions.recording import KINDS, record_demonstrations
+from mimic.motions.recording import record_demonstrations
 from mimic.runs.files import REPORT
 
 STUDY = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
-UNSEEN_SEED, UNSEEN = 1000, 32  # demonstrations that no run is trained on, the same for all
+UNSEEN_SEED, UNSEEN, UNSEEN_FILE = 1000, 32, "unseen.npz"  # demonstrations that no run is trained on
 
 
 class Case(NamedTuple):
@@ -61,8 +60,8 @@ def cases(preset: str) -> list[Case]:
     return [
         Case(group, name.format(**values), f"{settings} {arguments}".format(**extent, **values).split(), seeds)
         for group, named in STUDY["cases"].items()
-        for settings in [extent["mixed" if group in STUDY["mixed"] else "arguments"]]
-        for seeds in [extent["seeds"] if group in STUDY["several_seeds"] else 1]
+        for settings in [f"{extent['arguments']} {extent['one_kind'] if group in STUDY['one_kind'] else ''}"]
+        for seeds in [1 if group in STUDY["one_seed"] else extent["seeds"]]
         for name, arguments in named.items()
         for values in _values(name)
     ]
@@ -76,13 +75,13 @@ def _values(name: str) -> list[dict[str, str]]:
         return [
             {"real": arm, "others": ",".join(other for other in STUDY["real"] if other != arm)} for arm in STUDY["real"]
         ]
-    locks = [lock for count in (1, 2) for lock in itertools.combinations("1234567", count)]
-    return [{"joints": "-".join(lock), "list": ",".join(lock)} for lock in locks] if "{joints}" in name else [{}]
+    return [{}]
 
 
-def evaluations(chosen: Sequence[Case], folder: Path, unseen: dict[str, str]) -> dict[Path, list[str]]:
+def evaluations(chosen: Sequence[Case], folder: Path) -> dict[Path, list[str]]:
     """Commands that evaluate policies on other demonstrations and arms, and other controllers, by their new folders."""
     seeds, commands = {case.name: case.seeds for case in chosen}, {}
+    unseen = setting("demonstrations", str(folder / UNSEEN_FILE))
     for pattern, kinds in STUDY["evaluations"].items():
         for values in _values(pattern):
             name = pattern.format(**values)
@@ -90,20 +89,12 @@ def evaluations(chosen: Sequence[Case], folder: Path, unseen: dict[str, str]) ->
                 for seed in range(seeds.get(name, 0) if kind == "unseen" else min(seeds.get(name, 0), 1)):
                     run, out = folder / name / str(seed), folder / f"{name}--{kind}" / str(seed)
                     paths = setting("run", str(run)), setting("out", str(out))
-                    overrides = [unseen.get(argument) or argument.format(**values) for argument in arguments.split()]
+                    overrides = [
+                        unseen if argument == "{unseen}" else argument.format(**values)
+                        for argument in arguments.split()
+                    ]
                     commands[out] = [sys.executable, "-m", "mimic.evaluate", *paths, *overrides]
     return commands
-
-
-def unseen_demonstrations(folder: Path) -> dict[str, str]:
-    """Overrides with the files of demonstrations that no run is trained on, by their placeholders."""
-    overrides = {}
-    for kind in KINDS:
-        path = folder / f"unseen-{kind}.npz"
-        overrides[f"{{{kind}}}"] = setting("demonstrations", str(path))
-        if not path.exists():
-            record_demonstrations(build_arm(ArmConfig()), UNSEEN, kind=kind, seed=UNSEEN_SEED).save(path)
-    return overrides
 
 
 def run(chosen: Sequence[Case], folder: Path, jobs: int) -> list[Path]:
@@ -114,7 +105,9 @@ def run(chosen: Sequence[Case], folder: Path, jobs: int) -> list[Path]:
     sweeps = {logs / f"{case.name}.log": case.command(folder) for case in chosen if not case.done(folder)}
     failed = run_parallel(sweeps, jobs=jobs, devices=devices)
     commands = {}
-    for out, command in evaluations(chosen, folder, unseen_demonstrations(folder)).items():
+    if not (folder / UNSEEN_FILE).is_file():
+        record_demonstrations(build_arm(ArmConfig()), UNSEEN, kind="pid", seed=UNSEEN_SEED).save(folder / UNSEEN_FILE)
+    for out, command in evaluations(chosen, folder).items():
         trained = folder / out.parent.name.partition("--")[0] / out.name
         if (trained / REPORT).is_file() and not (out / REPORT).is_file():
             out.parent.mkdir(exist_ok=True)

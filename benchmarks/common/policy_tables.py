@@ -1,7 +1,7 @@
 """The pages' tables of poses and policies of one pair of arms: rows of cells, the header first."""
 
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from benchmarks.common.cells import (
     ENVIRONMENTS,
@@ -52,26 +52,20 @@ def mapper_presets(mapper: Results) -> list[Cells]:
 # Dynamic imitation
 
 
-def preset_runs(preset: Results, env: str) -> list[Results]:
-    """The reports of the three seeds of an environment."""
-    return [run for name, run in preset["results"].items() if name.startswith(env)]
+def simulations(study: Results, peer: Results) -> list[Cells]:
+    """Gaps of the paper's three simulations: default settings, the paper's, and stable-baselines3 with the paper's."""
 
+    def gap(gaps: Sequence[Results]) -> str:
+        splits = ([100 * of_seed[split] for of_seed in gaps] for split in ("train", "held_out"))
+        return " / ".join(f"{statistics.fmean(values):.2f} ± {statistics.stdev(values):.2f}" for values in splits)
 
-def mean(reports: Iterable[Results], split: str) -> float:
-    return statistics.fmean(report["optimality_gap"][split] for report in reports)
-
-
-def simulations(study: Results, preset: Results) -> list[Cells]:
-    def gap(reports: Sequence[Results], split: str) -> str:
-        deviation = statistics.stdev(report["optimality_gap"][split] for report in reports)
-        return f"{100 * mean(reports, split):.2f} ± {100 * deviation:.2f}"
-
-    rows: list[Cells] = [("joints", "trained on", "training", "held out", "the paper's setting, one seed")]
-    cases = [("one_demonstration", "7 to 7", "1", study["results"]["one_demonstration"])]
-    cases += [(env, joints, "124", preset_runs(preset, env)) for env, joints in ENVIRONMENTS.items()]
-    for name, joints, count, reports in cases:
-        paper = study["results"][f"{name}-paper"][0]["optimality_gap"]
-        rows.append((joints, count, gap(reports, "train"), gap(reports, "held_out"), split_pair(paper)))
+    rows: list[Cells] = [("joints", "trained on", "default", "the paper's", "stable-baselines3, the paper's")]
+    cases = [("one_demonstration", "7 to 7", "panda7dof", 1)]
+    cases += [(env, joints, env, 124) for env, joints in ENVIRONMENTS.items()]
+    for name, joints, env, count in cases:
+        ours = ([run["optimality_gap"] for run in study["results"][f"{name}{suffix}"]] for suffix in ("", "-paper"))
+        others = [row["gap"] for row in where(peer["rows"], env=env, demonstrations=count)]
+        rows.append((joints, f"{count}", *map(gap, ours), gap(others)))
     return rows
 
 

@@ -7,9 +7,6 @@ import pytest
 
 from benchmarks import study
 from mimic.commands import cli
-from mimic.metric.config import MetricConfig
-
-UNSEEN = {f"{{{kind}}}": f"demonstrations={kind}.npz" for kind in ("computed_torque", "reach")}
 
 
 @pytest.fixture(scope="module")
@@ -28,9 +25,10 @@ def test_every_run_and_evaluation_has_arguments_that_the_commands_take(preset, c
         command = case.command(tmp_path)
         assert command[1:4] == ["-m", "mimic.train", "-m"] and f"hydra.sweep.dir={tmp_path / case.name}" in command
         config = compose("train", case.arguments)
-        assert config.env.physics == ("mjx" if case.group == "mjx" else "auto")
-    evaluated = study.evaluations(cases, tmp_path, UNSEEN)
-    assert len(evaluated) == (58 if preset == "paper" else 54)
+        one_kind = case.group in ("simulations", "paper_setting")
+        assert config.env.demonstrations.kind == ("pid" if one_kind else "mixed")
+    evaluated = study.evaluations(cases, tmp_path)
+    assert len(evaluated) == (22 if preset == "paper" else 18)
     kinds = {out.parent.name.partition("--")[2]: out for out in evaluated}
     for out in evaluated if preset == "paper" else kinds.values():
         config = compose("evaluate", evaluated[out][3:])
@@ -53,12 +51,6 @@ def test_a_group_is_measured_once_all_of_its_runs_are_there(tmp_path):
     assert study.measurements(chosen, tmp_path, out, 1) == {}
 
 
-def test_the_sweep_locks_every_joint_and_every_pair():
-    locked = {case.name: case.arguments for case in study.cases("paper") if case.group == "locked"}
-    assert len(locked) == 7 + 21 and {"locked-1", "locked-6-7"} <= set(locked)
-    assert "env.learner.locked=[6,7]" in locked["locked-6-7"]
-
-
 def test_no_real_arm_is_trained_on_where_it_is_unseen(compose):
     named = {
         case.name: compose("train", case.arguments).env for case in study.cases("paper") if case.group == "unseen_arms"
@@ -70,12 +62,3 @@ def test_no_real_arm_is_trained_on_where_it_is_unseen(compose):
         assert (alone.learner.model, alone.metric, alone.action_scale) == (
             *(name, named[f"{name}-unseen"].metric, named[f"{name}-unseen"].action_scale),
         )
-
-
-def test_the_variants_change_the_metric_as_they_are_named(compose):
-    cases = {case.name: case for case in study.cases("paper") if case.group == "variants"}
-    reference = MetricConfig()
-    for name, correspondence, links in (("hard", "hard", "kept"), ("paper_metric", "overlap", "merged")):
-        metric = compose("train", cases[f"variant-{name}"].arguments).env.metric
-        assert (metric.correspondence, metric.links) == (correspondence, links)
-    assert f"env.metric.translation={4 * reference.translation:g}" in cases["variant-positions_x4"].arguments
