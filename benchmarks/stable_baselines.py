@@ -1,6 +1,6 @@
 """PPO of stable-baselines3 with its default settings on the tasks of mimic's runs, and the gaps of both.
 
-    python -m benchmarks.stable_baselines --out FILE --runs RUN [RUN ...] [--steps 5000000] [--jobs N]
+    python -m benchmarks.stable_baselines --out FILE --runs RUN [RUN ...] [--steps 3000000] [--jobs N]
 
 RUN is a run directory of `python -m mimic.train`. Environment, motions, discount factor and seed are those of the run;
 everything else is what the package sets, as for the paper, which states no more. A batch has its 2,048 steps, of 64
@@ -64,7 +64,7 @@ def learn(run: Path, steps: int) -> Row:
 
 
 def main() -> None:
-    parser = make_parser("stable_baselines", __doc__, steps=5_000_000, jobs=os.cpu_count() or 1)
+    parser = make_parser("stable_baselines", __doc__, steps=3_000_000, jobs=os.cpu_count() or 1)
     parser.add_argument("--runs", nargs="+", type=Path, required=True, metavar="RUN")
     options = parser.parse_args()
 
