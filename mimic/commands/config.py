@@ -358,10 +358,11 @@ class RetargetConfig:
       joints, topic, units, rate: of `source`, see `RecordingConfig`.
       demonstrations: file of the expert's demonstrations, in place of `source`.
       env: environment that defines the arms and the metric.
+      mapper: run directory of a pose mapper of these arms, used instead of the optimiser.
       limits: see `EnvConfig`. Default None: those of the environment; with `source` those of the models.
       out: folder of the data set, or file of the learner's motions; must not exist.
-      costs: see `Costs`.
-      seed: seed of the random initial poses.
+      costs: see `Costs`; of the optimiser.
+      seed: seed of the random initial poses of the optimiser.
       compilation_cache: see `TrainConfig`.
     """
 
@@ -375,6 +376,7 @@ class RetargetConfig:
     rate: float | None = number(None, at_least=0.1, at_most=1e5)
     demonstrations: str = ""
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
+    mapper: str = ""
     limits: str | None = None
     out: str = ""
     costs: Costs = dataclasses.field(default_factory=Costs)
@@ -383,8 +385,10 @@ class RetargetConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        if self.source and self.demonstrations:
-            raise ValueError("source: expected no demonstrations= with a data set")
+        if self.mapper and self.costs != Costs():
+            raise ValueError("costs: expected none with a mapper, which does not minimise them")
+        if self.source and (self.demonstrations or self.mapper):
+            raise ValueError("source: expected neither demonstrations= nor mapper= with a data set")
         check_choice("hand", self.hand, _HANDS)
         check_choice("failing", self.failing, _FAILING)
         _ = self.placement

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import jax
 import numpy as np
 import pytest
 
@@ -10,6 +11,8 @@ import mimic
 from mimic.commands import retarget_data
 from mimic.commands.retarget import retarget
 from mimic.retargeting.certificate import Certificate
+from mimic.trainers.config import PoseMapperConfig
+from mimic.trainers.pose_mapper.model import make_model
 from tests.helpers.commands import run
 
 
@@ -32,14 +35,17 @@ def test_the_motions_load_and_do_not_jump(recorded, tmp_path):
 
 
 @pytest.mark.slow
-def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows():
+@pytest.mark.parametrize("with_mapper", [False, True], ids=["optimised", "mapped"])
+def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows(with_mapper):
     """The expert's poses are random, so that the learner would jump at each step; the last joint's limit is unknown."""
     env, dt, rng = mimic.env_config("planar4dof"), 0.1, np.random.default_rng(0)
     expert, learner = (mimic.build_arm(arm).embodiment for arm in (env.expert, env.learner))
     learner = dataclasses.replace(learner, velocity_limit=np.array([0.5, 1.0, 2.0, np.inf]))
     qpos = rng.uniform(-3, 3, (2, 8, expert.num_joints))
     leaps = mimic.Demonstrations(qpos, 0 * qpos, qpos[:, -1], dt, expert.name, expert.joint_names)
-    motions, report = retarget(leaps, expert, learner, env.metric)
+    model = make_model(env, PoseMapperConfig(hidden_layers=[16]).resolve())
+    mapper = mimic.PoseMapper(model, model.init(jax.random.key(0))) if with_mapper else None
+    motions, report = retarget(leaps, expert, learner, env.metric, mapper=mapper)
     jumps, largest = np.abs(np.diff(motions.qpos, axis=1)), dt * np.array([0.5, 1.0, 2.0, np.pi])
     assert np.all(jumps <= largest + 1e-6)  # float32, of angles up to 6 rad
     assert np.all(jumps.max(axis=(0, 1)) > largest - 1e-6)  # each joint reaches its bound
@@ -51,7 +57,7 @@ def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows():
     ("arguments", "message"),
     [
         (["env=planar4dof"], "expected a data set or a file of demonstrations"),
-        (["source=none.csv", "demonstrations={recorded}"], "source: expected no demonstrations= with a data set"),
+        (["source=none.csv", "demonstrations={recorded}"], "source: expected neither demonstrations= nor mapper="),
         (["source=none.csv", "hand=firm"], "hand: expected one of exact, near, scaled"),
         (["source=none.csv", "base=[1,2]"], "base: expected same, auto or [x,y,z,yaw], got [1, 2]"),
         (["source=none.csv", "failing=maybe"], "failing: expected one of left_out, kept"),
@@ -63,6 +69,7 @@ def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows():
             "learner: expected an arm, or an environment",
         ),
         (["demonstrations={recorded}", "env=planar4dof", "out={recorded}"], "exists; name a new file"),
+        (["demonstrations={recorded}", "env=planar4dof", "out=new.npz", "mapper=."], "not a run directory"),
     ],
 )
 def test_bad_input(reason, recorded, arguments, message):

@@ -127,8 +127,9 @@ def test_pose_mapper(said, tmp_path):
     names = "optimiser", "mapper", "zero pose"
     distances = [number(rf"\n{name} +mean distance (\S+)", said) for name in names]
     assert distances == sorted(distances)
-    motions = mimic.load_demonstrations(tmp_path / "optimised.npz")
-    assert motions.joint_names == ("joint1", "joint2", "joint4", "joint5") and motions.count == 4
+    for name in ("optimised", "mapped"):
+        motions = mimic.load_demonstrations(tmp_path / f"{name}.npz")
+        assert motions.joint_names == ("joint1", "joint2", "joint4", "joint5") and motions.count == 4
     assert is_picture(tmp_path / "retargeted.png")
 
 

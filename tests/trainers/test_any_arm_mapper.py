@@ -12,7 +12,8 @@ import pytest
 
 import mimic
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, lock_joints, stack_arms
-from mimic.commands.config import EvaluateConfig
+from mimic.commands import retarget
+from mimic.commands.config import EvaluateConfig, RetargetConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs import env_config
 from mimic.envs.family import arm_sampler
@@ -266,6 +267,21 @@ def test_each_sample_has_an_expert_and_a_learner_of_its_own(runs, mapper):
         distances = training.mapper_objective(model, sampler).distances
         shape = jax.eval_shape(distances, params, jax.random.split(jax.random.key(1), 3)).shape
         assert shape == (3, model.config.heads) and len(set(map(id, keys))) == count
+
+
+@pytest.mark.slow
+def test_motions_are_retargeted_to_any_learner(runs, tmp_path, own_registry):
+    mimic.register("environment", "from_four", {"expert": FOUR, "learner": {"model": "panda"}})
+    for name, run, joints in (("panda4dof", "fixed", 4), ("panda3dof", "fixed", 3), ("from_four", "drawn", 7)):
+        env = mimic.make(name, demonstrations={"count": 2, "held_out": 1})
+        expert, out = tmp_path / f"{name}.npz", tmp_path / f"{name}-mapped.npz"
+        env.demonstrations.save(expert)
+        config = RetargetConfig(demonstrations=str(expert), env=env_config(name), mapper=str(runs[run]), out=str(out))
+        retarget.prepare_retargeting(config)()
+        assert mimic.load_demonstrations(out).qpos.shape == (2, 51, joints)
+    config = dataclasses.replace(config, mapper=str(runs["fixed"]), out=str(tmp_path / "new.npz"))
+    with pytest.raises(ValueError, match="mapper: its expert is panda with joints"):
+        retarget.prepare_retargeting(config)
 
 
 @pytest.mark.slow
