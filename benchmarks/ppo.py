@@ -1,11 +1,10 @@
-"""Environment steps per second with learning: PPO on our environments, on a stock one, and as in the paper.
+"""Environment steps per second with learning: PPO on our environments and on a stock one.
 
     python -m benchmarks.ppo --out FILE [--env panda4dof] [--only CASE ...] [--num-envs N]
 
-PPO as `mimic.train` runs it, with the settings of the preset; brax's own training loop on the same environment, and on
-the same task as brax and MuJoCo Playground environments usually implement it; and, if it is installed, PPO of
-stable-baselines3 on C MuJoCo on the CPU, with the same networks, minibatches and passes, and an arm for each core. The
-speed is the median of all epochs but the first, which compiles, with the quartiles as spread.
+PPO as `mimic.train` runs it, with the settings of the preset; and brax's own training loop on the same environment, and
+on the same task as brax and MuJoCo Playground environments usually implement it. The speed is the median of all epochs
+but the first, which compiles, with the quartiles as spread.
 """
 
 import time
@@ -28,7 +27,6 @@ from mimic.envs.wrappers import wrap_for_training
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo.ppo import compile_training
 
-STABLE_BASELINES = "stable-baselines3, C MuJoCo"
 EPOCHS = 6  # the first compiles
 SETTINGS = (  # that brax's PPO has under the same names
     "num_envs", "learning_rate", "entropy_cost", "discounting", "unroll_length", "batch_size", "num_minibatches",
@@ -85,19 +83,11 @@ def brax_loop(physics: str, name: str, config: PPOConfig, batches: int) -> dict[
     return rates(batches * config.steps_per_batch, times)
 
 
-def stable_baselines(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
-    from benchmarks.peers import baselines  # of a package that may not be installed
-
-    del batches  # the CPU is slow: one
-    return rates(*baselines.learn(name, config, EPOCHS))
-
-
 CASES: dict[str, Case] = {
     "mimic, fused": partial(mimic_loop, "fused"),
     "mimic, mjx": partial(mimic_loop, "mjx"),
     "brax's loop, fused": partial(brax_loop, "fused"),
     "brax's loop, mjx.Data carried": partial(brax_loop, "stock"),
-    STABLE_BASELINES: stable_baselines,
 }
 
 
@@ -106,7 +96,7 @@ def run(name: str, config: PPOConfig, case: str, batches: int) -> Row:
     began = time.perf_counter()
     try:
         row |= CASES[case](name, config, batches)
-    except Exception as error:  # not installed, or out of memory
+    except Exception as error:  # out of memory
         row |= failure(error)
     return {**row, "wall_s": round(time.perf_counter() - began, 1)}
 

@@ -11,6 +11,7 @@ import functools
 import json
 import multiprocessing
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from mimic.trainers.ppo.trainer import run_environment
 from mimic.trainers.run_config import load_config
 
 ARMS, BATCH = 64, 2048
-COLUMNS = "env demonstrations seed steps:,.0f gap[train]:.2% gap[held_out]:.2% mimic[train]:.2% mimic[held_out]:.2%"
+COLUMNS = "env demonstrations seed steps:,.0f steps_per_s:,.0f gap[train]:.2% gap[held_out]:.2% mimic[held_out]:.2%"
 
 
 def mean_action(weights: dict[str, Any]) -> Controller:
@@ -55,12 +56,15 @@ def learn(run: Path, steps: int) -> Row:
     config, report = load_config(run), json.loads((run / REPORT).read_text())
     env, held_out = run_environment(config.env, run)
     options = {"n_steps": BATCH // ARMS, "gamma": config.trainer.discounting, "seed": config.seed, "device": "cpu"}
+    began = time.perf_counter()
     model = PPO("MlpPolicy", Arms(VectorEnv(env, num_envs=ARMS)), **options).learn(steps)
+    rate = model.num_timesteps / (time.perf_counter() - began)
     weights = {name: jnp.asarray(value.numpy()) for name, value in model.policy.state_dict().items()}
     evaluator = Evaluator(env, held_out)
     summary = evaluator.summary(jax.jit(lambda: evaluator.rollout(mean_action(weights)))())
     task = {"env": config.env.name, "demonstrations": env.demonstrations.count, "seed": config.seed}
-    return {**task, "steps": model.num_timesteps, "gap": summary["optimality_gap"], "mimic": report["optimality_gap"]}
+    speed = {"steps": model.num_timesteps, "steps_per_s": round(rate)}
+    return {**task, **speed, "gap": summary["optimality_gap"], "mimic": report["optimality_gap"]}
 
 
 def main() -> None:

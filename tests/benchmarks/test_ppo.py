@@ -38,30 +38,6 @@ def test_the_stock_environment_is_the_same_task():
 
 
 @pytest.mark.slow
-def test_the_task_on_mujoco_is_the_same():
-    mujoco_task = pytest.importorskip("benchmarks.peers.mujoco_task", exc_type=ImportError)  # gymnasium is an extra
-    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 3, "held_out": 1})
-    task = mujoco_task.MujocoTask(env)
-    ours, step = env.begin(env.start(jax.random.PRNGKey(0), 1)), jax.jit(env.step)
-    np.testing.assert_allclose(task.reset(options={"demonstration": 1})[0], ours.obs, atol=1e-6)
-    action = np.full(env.action_size, 0.05)
-    over = False
-    for _ in range(env.config.horizon):
-        ours = step(ours, jnp.asarray(action))
-        observation, reward, over, _, _ = task.step(action)
-        np.testing.assert_allclose(observation, ours.obs, atol=1e-3)  # float32 against float64, 500 physics steps
-        np.testing.assert_allclose(reward, ours.reward, atol=1e-3)
-    assert over and ours.done
-
-
-@pytest.mark.slow
-def test_ppo_runs_on_mujoco():
-    pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
-    row = ppo.run("planar4dof", SMALL, ppo.STABLE_BASELINES, batches=1)
-    assert "failed" not in row and row["steps_per_s"] > 0
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("case", ["brax's loop, fused", "brax's loop, mjx.Data carried"])
 def test_brax_own_loop_learns_on_both_environments(case):
     row = ppo.run("planar4dof", SMALL, case, batches=1)
