@@ -11,21 +11,6 @@ import mimic
 from mimic.envs.wrappers import wrap_for_training
 from tests.helpers.tiny import SHORT_ARMS
 
-
-def test_observations_of_new_episodes_match_their_states():
-    """In a batch where some episodes end: the wrapper composes the observations itself."""
-    env = mimic.make("planar4dof", **SHORT_ARMS, demonstrations={"count": 3})
-    wrapped = wrap_for_training(env, env.config.horizon + 1)
-    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 16))
-    step, observe = jax.jit(wrapped.step), jax.jit(jax.vmap(env.observe))
-    ended = 0.0
-    for _ in range(12):
-        np.testing.assert_allclose(state.obs, observe(state.pipeline_state), atol=1e-5)
-        state = step(state, jnp.full((16, env.action_size), 0.3))
-        ended += float(state.done.sum())
-    assert ended > 0
-
-
 FEW = {"count": 6, "held_out": 2}
 
 

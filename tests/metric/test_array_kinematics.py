@@ -1,15 +1,12 @@
 """Link states of any arm against those of its embodiment, and their derivatives."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mimic
-from mimic.arms.arm import ArmConfig, build_arm
-from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
+from mimic.arms.arrays import MAX_JOINTS, lock_joints
 from mimic.arms.sampler import random_arm
 from mimic.metric.correspondence import arc_length_correspondence
 from mimic.metric.kinematics import axes_and_origins, frame_table, link_states, states_in_frames
@@ -18,7 +15,6 @@ from tests.helpers.array_cases import Batch, random_source
 
 # 1e-16 of each step from base to tip, times speeds of up to 30 rad/s; link lengths round at 1e-16 of a metre too.
 ATOL = 1e-11
-FIELDS = ("position", "direction", "linear_velocity", "angular_velocity")
 
 
 @pytest.fixture(scope="module")
@@ -89,24 +85,3 @@ def test_correspondence_of_drawn_arms_integrates_along_both_chains():
         np.testing.assert_allclose(shares.sum(axis=axis), lengths / lengths.sum(1, keepdims=True), rtol=0, atol=2e-6)
         empty = np.moveaxis(matrix, axis, -1)[lengths == 0]
         assert not empty.any()
-
-
-def test_single_precision_and_locked_arms(x64):
-    """A locked joint keeps its angle: the links are those of the arm without this joint."""
-    panda = build_arm(ArmConfig(), limits="hardware")
-    reduced = build_arm(ArmConfig(locked=[3, 6]), limits="hardware")
-    free = ~np.isin(np.arange(7), (2, 5))
-    arm = arm_arrays(panda, free.tolist())
-    qpos, qvel = np.random.default_rng(0).uniform(-1, 1, (2, reduced.embodiment.num_joints))
-    all_qpos: Any = arm.home.copy()
-    all_qvel: Any = np.zeros(MAX_JOINTS)
-    all_qpos[:7][free], all_qvel[:7][free] = qpos, qvel
-    expected = mimic.link_states(reduced.embodiment, qpos, qvel)
-    single = stack_arms([arm.astype(np.float32)])
-    in_single = jax.vmap(link_states)(single, *(x[None].astype(np.float32) for x in (all_qpos, all_qvel)))
-    # float32: 6e-8 of each of about 20 steps, times speeds of 5 rad/s
-    for states, atol in ((link_states(arm, all_qpos, all_qvel), ATOL), (jax.tree.map(lambda x: x[0], in_single), 1e-5)):
-        for name in FIELDS:
-            actual = getattr(states, name)[: reduced.embodiment.num_links]
-            np.testing.assert_allclose(actual, getattr(expected, name), rtol=0, atol=atol)
-    assert {x.dtype for x in jax.tree.leaves(in_single)} == {np.dtype(np.float32)}

@@ -70,12 +70,3 @@ def test_measures_are_those_of_the_embodiments(batch):
         for name in MEASURES:
             np.testing.assert_allclose(values[name][i], expected[name], rtol=0, atol=atol(name))
             assert np.ptp(expected[name]) > 100 * atol(name)
-
-
-def test_centre_lines_are_those_of_the_embodiments(batch, samples=7):
-    lines = jax.jit(jax.vmap(lambda arm, pose: centre_line(arm, pose, samples=samples), (None, 0)))
-    for arrays, qpos, embodiment, own in batch[0]:
-        line = lines(arrays.astype(np.float32), qpos)
-        expected = centre_line_table(embodiment, own, samples=samples)
-        for name in ("points", "tangents", "hand_position", "hand_direction"):
-            np.testing.assert_allclose(getattr(line, name), getattr(expected, name), rtol=0, atol=ATOL)

@@ -144,31 +144,6 @@ def test_locked_random_arm_moves_as_in_mujoco(x64, seed, links):
 
 
 @pytest.mark.parametrize(
-    "arm",
-    [
-        pytest.param(panda(locked=(3, 6, 7)), marks=pytest.mark.slow),
-        planar_arm([0.3, 0.2, 0.4], frame_at=1.0),
-        load_mjcf(random_arms.random_arm(2)),
-    ],
-    ids=lambda arm: arm.name,
-)
-def test_body_twists_are_the_derivative_of_the_frames(x64, arm):
-    """V = T^-1 dT/dt, by forward-mode differentiation of the homogeneous matrix."""
-
-    def matrix(qpos):
-        frames = forward_kinematics(arm, qpos)
-        upper = jnp.concatenate([frames.rotation, frames.position[:, :, None]], axis=2)
-        lower = jnp.broadcast_to(jnp.asarray([0.0, 0, 0, 1]), (arm.num_links, 1, 4))
-        return jnp.concatenate([upper, lower], axis=1)
-
-    (qpos, *_), (qvel, *_) = motions(arm.num_joints)
-    T, dT = jax.jit(lambda *motion: jax.jvp(matrix, motion[:1], motion[1:]))(jnp.asarray(qpos), jnp.asarray(qvel))
-    V = jnp.linalg.inv(T) @ dT
-    expected = jnp.stack([V[:, 2, 1], V[:, 0, 2], V[:, 1, 0], V[:, 0, 3], V[:, 1, 3], V[:, 2, 3]], axis=1)
-    np.testing.assert_allclose(body_twists(arm, qpos, qvel), expected, atol=1e-12)  # rounding, 1e-15 a step
-
-
-@pytest.mark.parametrize(
     ("lengths", "frame_at"), [([0.7], 0.5), ([0.2, 0.1, 0.4, 0.3], 1.0), (np.linspace(0.1, 0.3, LONG + 2), 0.0)]
 )
 def test_planar_arm_has_the_closed_form(x64, lengths, frame_at):

@@ -46,19 +46,6 @@ def test_the_kernel_equals_the_looped_form(x64, interpreted, batch):
     assert not np.asarray(actual[1])[rests].any()
 
 
-@pytest.mark.slow
-def test_single_precision(interpreted, batch):
-    """With polynomials for cosines and sines, against double precision."""
-    with jax.enable_x64(True):
-        expected = jax.jit(jax.vmap(make_advance(TIMESTEP, SUBSTEPS)))(*batch)
-    arms, qpos, qvel, torque, load = jax.tree.map(lambda x: np.asarray(x, np.float32), batch)
-    kernel = jax.jit(gpu_kernel(TIMESTEP, SUBSTEPS, launch=LAUNCH))
-    actual = kernel(jax.vmap(joint_numbers)(arms), qpos, qvel, torque, np.stack(load, 1))
-    for values, reference in zip(actual, expected, strict=True):
-        scale = 1 + np.abs(reference).max(axis=1, keepdims=True)
-        np.testing.assert_allclose(values / scale, reference / scale, rtol=0, atol=1e-3)
-
-
 @pytest.mark.parametrize("largest", [4.0, 1e3, 1e5])
 def test_polynomials(largest):
     angle = np.random.default_rng(0).uniform(-largest, largest, 100_000).astype(np.float32)

@@ -12,7 +12,6 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, stack_arms
 from mimic.physics.composite_kernel import make_advance
 from mimic.physics.step import Load
-from tests.helpers.lowering import gpu_program
 
 TIMESTEP, SUBSTEPS, COUNT = 0.01, 10, 5
 ARMS = {
@@ -108,10 +107,3 @@ def test_gradients_are_finite_and_those_of_finite_differences(x64, mixed):
     expected = (moved(1) - moved(-1)) / (2 * step)
     actual = np.sum(gradient[3] * d_torque) + np.sum(gradient_of_arms.damping * d_damping)
     np.testing.assert_allclose(actual, expected, rtol=1e-6)  # 1e-16 / 1e-6, times a hundred, and the step squared
-
-
-@pytest.mark.slow  # the inner loop has the same kernel
-def test_the_kernel_lowers_without_a_gpu(mixed):
-    batched = jax.jit(jax.vmap(make_advance(TIMESTEP, 2)))
-    assert "triton" in gpu_program(batched, *mixed)
-    assert "triton" not in batched.lower(*mixed).as_text()

@@ -1,6 +1,5 @@
 """The dynamics of any arm against C MuJoCo in double precision."""
 
-import copy
 import dataclasses
 import itertools
 
@@ -54,26 +53,6 @@ def test_random_arms_accelerate_as_in_mujoco(x64, batch):
         assert_near(actual, np.stack(expected))
         assert_near(actual, batch.qacc)  # what `torque` was computed from
         assert empty.any() and not actual[empty].any()
-
-
-@pytest.mark.slow
-def test_gravity_is_that_of_mujoco(x64, batch):
-    """As an acceleration of the base, in the frame of the first joint."""
-    gravity, expected = np.array([1.0, -2.0, -9.0]), []
-    for arm, (qpos, qvel, _, torque) in zip(batch.arms, batch.motions, strict=True):
-        model = copy.copy(arm.model)
-        model.opt.gravity = gravity
-        model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
-        expected.append(padded(acceleration(model, qpos, qvel, torque)))
-    to_world = [
-        arm.T_world_base[:3, :3] @ frame for arm, frame in zip(batch.arms, batch.arrays.base_rotation, strict=True)
-    ]
-    base = tuple(np.stack([rotation.T @ -gravity for rotation in to_world]).T)
-    for form in (looped, unrolled):
-        actual = jax.jit(jax.vmap(lambda *x, form=form: form(*x[:4], base=x[4])))(
-            batch.arrays, batch.qpos, batch.qvel, batch.torque, base
-        )
-        assert_near(np.asarray(actual), np.stack(expected))
 
 
 def test_inertia_matrix_is_that_of_mujoco(x64, batch):

@@ -10,7 +10,6 @@ import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.simulation_model import simulation_model
 from mimic.base import fused_kernel
-from mimic.envs.config import PHYSICS
 from mimic.physics import dynamics
 from mimic.physics.joint_numbers import joints_of_model
 from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
@@ -306,34 +305,3 @@ def test_default_substeps_keep_the_tip_within_1_mm():
         expected.append(data.qpos.copy())
     apart = tip(final(jnp.asarray(torques, jnp.float32))) - tip(jnp.asarray(expected, jnp.float32))
     assert np.linalg.norm(apart, axis=-1).max() < 1e-3
-
-
-DT = 0.1
-
-
-@pytest.fixture(scope="module")
-def panda_scale():
-    """Maximum torques."""
-    return np.asarray(mimic.make("panda7dof", demonstrations={"count": 1, "held_out": 1}).torque_scale)
-
-
-@pytest.mark.slow_for("mjx-load0", "mjx-load1")
-@pytest.mark.parametrize("load", [Load(), Load(mass=1.2, damping=3.0)])
-@pytest.mark.parametrize("physics", PHYSICS)
-def test_the_panda_moves_as_in_mujoco(panda_scale, physics, load):
-    """1 s of random torques at the default step. 1e-4 rad: float32 over ten control steps."""
-    model = build_arm(ArmConfig()).model
-    substeps = mimic.env_config("panda7dof").substeps
-    model.opt.timestep = DT / substeps
-    torques = np.random.default_rng(0).uniform(-1, 1, (10, 7)) * panda_scale
-    advance = jax.jit(make_advance(model, DT / substeps, substeps, physics))
-    model.body_mass *= load.mass
-    model.body_inertia *= load.mass
-    model.dof_damping *= load.damping
-    data = mujoco.MjData(model)
-    qpos, qvel = jnp.zeros(7), jnp.zeros(7)
-    for torque in torques:
-        data.qfrc_applied[:] = torque
-        mujoco.mj_step(model, data, substeps)
-        qpos, qvel = advance(qpos, qvel, jnp.asarray(torque, jnp.float32), load)
-        np.testing.assert_allclose(qpos, data.qpos, atol=1e-4)

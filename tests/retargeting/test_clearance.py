@@ -4,7 +4,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
@@ -12,7 +11,6 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.control.clearance import clearance
 from mimic.metric.capsule_distances import capsule_axes, changing_pairs, clearance_constants, pair_distances
-from tests.helpers.virtual_robots import model
 
 CONFIGS = {"panda": ArmConfig(), "locked": ArmConfig(locked=[3, 6, 7]), "two arms": ArmConfig(model="panda_pair")}
 
@@ -38,26 +36,6 @@ def test_it_is_the_distance_of_the_costs(config):
     assert np.ptp(actual) > 0.1 and actual.dtype == np.float32
     # The costs smooth distances by 0.1 mm where axes cross; there is none otherwise.
     np.testing.assert_allclose(actual, jax.jit(jax.vmap(expected))(qpos), atol=2e-4)
-
-
-def test_it_is_that_of_mujocos_geoms():
-    """The geoms of the virtual robot, by MuJoCo's own function."""
-    robot = model().simulated.model
-    data = mujoco.MjData(robot)
-    arm = build_arm(ArmConfig(), "hardware").embodiment
-    constants, rows = clearance_constants(arm, fit_capsules(ArmConfig(), "hardware")), poses(arm, 100, seed=1)
-    expected = []
-    for qpos in rows:
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(robot, data)
-        pairs = zip(robot.pair_geom1, robot.pair_geom2, strict=True)
-        expected.append(min(mujoco.mj_geomDistance(robot, data, i, j, 10.0, None) for i, j in pairs))
-    # Intersecting capsules: MuJoCo and we may differ by how deep; only the sign counts.
-    expected, value = np.array(expected), clearance(rows, constants)
-    apart = expected > 1e-3
-    assert 10 < apart.sum() < 95
-    np.testing.assert_allclose(value[apart], expected[apart], atol=1e-5)
-    assert np.all(value[~apart] < 2e-3)
 
 
 def test_an_arm_without_pairs_has_the_clearance_of_the_floor():

@@ -1,13 +1,13 @@
-"""Exact hands: against closed forms, dense searches, C MuJoCo and closed-form inverse kinematics."""
+"""Exact hands: against closed forms, dense searches and closed-form inverse kinematics."""
 
 import dataclasses
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
-from mimic.arms.embodiment import Embodiment, panda, panda_path, planar_arm
+from mimic.arms.embodiment import Embodiment, panda, planar_arm
+from mimic.arms.link_match import hand_poses
 from mimic.metric.config import MetricConfig
 from mimic.metric.distance import embodiment_distance
 from mimic.metric.kinematics import link_states
@@ -183,22 +183,6 @@ ARM = panda(limits="hardware")
 OFFSET = np.array([0.15, -0.1, 0.05, 0.5])
 
 
-def hand_poses(arm: Embodiment, qpos: np.ndarray) -> np.ndarray:
-    """Hand poses [..., 4, 4] of a Panda, by C MuJoCo."""
-    model = mujoco.MjModel.from_xml_path(panda_path())
-    data, poses = mujoco.MjData(model), []
-
-    def body(angles: np.ndarray) -> np.ndarray:
-        data.qpos[: len(angles)] = angles
-        mujoco.mj_kinematics(model, data)
-        last = model.jnt_bodyid[arm.num_joints - 1]
-        return homogeneous(data.xmat[last].reshape(3, 3), data.xpos[last])
-
-    hand = np.linalg.inv(body(np.zeros(7))) @ homogeneous(arm.hand_rotation[0], arm.hand_position[0])
-    poses = [body(np.asarray(angles, float)) @ hand for angles in qpos.reshape(-1, 7)]
-    return np.stack(poses).reshape(*qpos.shape[:-1], 4, 4)
-
-
 def homogeneous(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, position
@@ -206,10 +190,10 @@ def homogeneous(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def check_hands(solution, qpos: np.ndarray) -> None:
-    """Exact hands are where C MuJoCo says, within the joint ranges."""
+    """Exact hands are where the kinematics in double precision say, within the joint ranges."""
     base = placement(OFFSET)
-    expected = np.linalg.inv(homogeneous(*base)) @ hand_poses(ARM, qpos)
-    own, exact = hand_poses(ARM, np.asarray(solution.qpos)), np.asarray(solution.hand.exact)
+    expected = np.linalg.inv(homogeneous(*base)) @ hand_poses(ARM, qpos)[..., 0, :, :]
+    own, exact = hand_poses(ARM, np.asarray(solution.qpos))[..., 0, :, :], np.asarray(solution.hand.exact)
     apart = np.linalg.norm((own - expected)[..., :3, 3], axis=-1)
     turned = np.linalg.norm((own - expected)[..., :3, :3], axis=(-2, -1)) / np.sqrt(2)
     assert apart[exact].max() < POSITION_TOLERANCE / 10 and turned[exact].max() < ROTATION_TOLERANCE / 10
@@ -227,7 +211,7 @@ def test_what_closed_form_inverse_kinematics_solves_is_solved():
     check_hands(solution, qpos)
     points = np.concatenate([np.zeros((1, 3)), ARM.joint_anchor, ARM.hand_position])
     peer = ssik.Manipulator.from_axes(ARM.joint_axis, np.diff(points, axis=0), limits=ARM.joint_range)
-    targets = np.linalg.inv(homogeneous(*placement(OFFSET))) @ hand_poses(ARM, qpos)
+    targets = np.linalg.inv(homogeneous(*placement(OFFSET))) @ hand_poses(ARM, qpos)[:, 0]
     targets[:, :3, :3] = targets[:, :3, :3] @ ARM.hand_rotation[0].T
     solved = np.array([bool(peer.solve(target)) for target in targets])
     assert 0.3 < solved.mean() < 0.95
