@@ -8,7 +8,6 @@ already a controller of any arm, and a policy learns what it lacks.
 
 import copy
 import dataclasses
-import functools
 from typing import cast
 
 import jax
@@ -40,6 +39,9 @@ _HOLD_SAMPLES = 5  # steps of a demonstration at which the distance of holding t
 _RUNAWAY = 3.0  # distance charged for each step after a runaway, as a multiple of that of holding the home pose
 _EXCESS = 0.01  # added to the excess of both distances in a relative reward, in units of holding the home pose
 _MIN_HOLD = 1e-3  # distance; below it, an arm that rests is already where the expert is
+
+
+_states_of_motions = jax.jit(jax.vmap(jax.vmap(link_states, (None, 0, 0)), (None, 0, 0)))
 
 
 @struct.dataclass
@@ -110,8 +112,7 @@ class AnyArmEnv(ImitationEnv):
         padding = [(0, 0), (0, 0), (0, MAX_JOINTS - self.expert.num_joints)]
         motions = (np.pad(x, padding).astype(np.float32) for x in (demonstrations.qpos, demonstrations.qvel))
         # By the kinematics of the learners, so that an arm that equals the expert can match it exactly.
-        states = functools.partial(link_states, self.expert_arrays)
-        self.expert_states = jax.jit(jax.vmap(jax.vmap(states)))(*motions)
+        self.expert_states = _states_of_motions(self.expert_arrays, *motions)
 
     def by_distance(self) -> "AnyArmEnv":
         """The same environment without a baseline to simulate.

@@ -112,11 +112,11 @@ class Evaluator:
             self._references = Background(lambda: references_of_one_arm(self.env))
             return
         assert isinstance(env, AnyArmEnv) and controller is not None
-        of_many = self.env = env.by_distance().with_demonstrations(held_out)
         names = [(split, name) for split, key in zip(SPLITS, (SEEN, UNSEEN), strict=True) for name in arms[key]]
         if len({name for _, name in names}) < max(len(names), 1):
             shown = ", ".join(name for _, name in names)
             raise ValueError(f"arms: expected arms of different names in the report, got {shown}")
+        of_many = self.env = env.by_distance().with_demonstrations(held_out)
         count = held_out.count
         self.groups = [Group(*names[i], slice(i * count, (i + 1) * count)) for i in range(len(names))]
         stacked = stack_arms([arm for key in (SEEN, UNSEEN) for arm in arms[key].values()]).astype(np.float32)

@@ -8,9 +8,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.link_match import hand_poses
 from mimic.arms.pose_limits import continuous_joints
 from mimic.metric.distance import NO_HAND, Correspondence, HandWeights, Metric, Reduction, RotationMeasure, Weights
-from mimic.metric.kinematics import hand_frames
 from mimic.retargeting.hand_speeds import speeds_needed
 from mimic.retargeting.hand_target import POSITION_TOLERANCE, Placement, placement
 from mimic.retargeting.pose import checked_poses, imitate_pose
@@ -96,8 +96,8 @@ def find_base(
 
 def _places(arm: Embodiment, qpos: Float[np.ndarray, "poses joints"]) -> Float[np.ndarray, "poses numbers"]:
     """Positions and axes of the hands, of which a metre counts as 1.4 radians."""
-    hands = jax.device_get(jax.jit(jax.vmap(lambda pose: hand_frames(arm, pose)))(qpos))
-    return np.concatenate([hands.position.reshape(len(qpos), -1), hands.rotation.reshape(len(qpos), -1) / 2], axis=1)
+    hands = hand_poses(arm, qpos)[..., :3, :]
+    return (hands / [2, 2, 2, 1]).reshape(len(qpos), -1)
 
 
 def _spread(places: np.ndarray, among: Int[np.ndarray, " chosen"], count: int) -> Int[np.ndarray, " count"]:
