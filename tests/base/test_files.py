@@ -161,12 +161,19 @@ ALLOWED = {  # by module and function, with the reason
 }
 
 
+_NAMES = {called.rpartition(".")[2] for called in OPENING}
+
+
+def _name(function):
+    return getattr(function, "attr", "") or getattr(function, "id", "")
+
+
 def opening_functions(source):
     """The functions in a module's text that open files to read them; calls that open a file to write do not count."""
     for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Call):
+        name = _name(node.func) if isinstance(node, ast.Call) else ""
+        if isinstance(node, ast.Call) and name in _NAMES:
             called = ast.unparse(node.func)
-            name = called.rpartition(".")[2]
             is_method = isinstance(node.func, ast.Attribute) or name in ("open", "Reader", "AnyReader")
             modes = [argument.value for argument in node.args if isinstance(argument, ast.Constant)]
             opens = is_method and not OPENING.isdisjoint((name, called))

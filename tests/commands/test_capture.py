@@ -90,6 +90,7 @@ def test_a_gap_in_the_other_arm_splits_nothing(tmp_path):
     assert [len(part.start) for part in capture.parts] == [300] and capture.bridged == 1
 
 
+@pytest.mark.slow
 def test_the_printed_command_trains_the_same_learner_on_the_clip(written, monkeypatch):
     folder, printed = written
     monkeypatch.chdir(folder)

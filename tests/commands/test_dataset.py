@@ -60,9 +60,8 @@ def write(out, **settings):
 
 @pytest.fixture(scope="module")
 def written(run_dir, tmp_path_factory):
-    """The rollouts of the run in both formats."""
-    folder = tmp_path_factory.mktemp("written")
-    return {format: write(folder / format, run=str(run_dir), format=format) for format in FORMATS}
+    """The rollouts of the run."""
+    return write(tmp_path_factory.mktemp("written") / "lerobot", run=str(run_dir))
 
 
 def frames(folder):
@@ -77,8 +76,8 @@ def frames(folder):
 
 def test_the_actions_lead_from_each_state_to_the_next(written):
     """The environment steps from each frame with the frame's torque, and arrives in the next one."""
-    columns = frames(written["lerobot"])
-    rows = pq.read_table(written["lerobot"] / "meta/episodes/chunk-000/file-000.parquet")
+    columns = frames(written)
+    rows = pq.read_table(written / "meta/episodes/chunk-000/file-000.parquet")
     final = np.array(rows["final/observation.state"].to_pylist())
     env = make_env(environment())
     states = np.concatenate([columns["observation.state"], final[:, None]], axis=1)
@@ -98,17 +97,17 @@ def test_the_actions_lead_from_each_state_to_the_next(written):
 
 def test_the_expert_of_a_rollout_is_its_demonstration(run_dir, written):
     demonstrations = mimic.load_demonstrations(run_dir / "demonstrations.npz")
-    columns = frames(written["lerobot"])
+    columns = frames(written)
     expected = np.concatenate([demonstrations.qpos, demonstrations.qvel], axis=-1)[:, :-1]
     np.testing.assert_array_equal(columns["observation.environment_state"], expected.astype(np.float32))
-    info = json.loads((written["lerobot"] / "meta/info.json").read_text())
+    info = json.loads((written / "meta/info.json").read_text())
     assert info["splits"] == {"train": f"0:{COUNT}", "held_out": f"{COUNT}:{COUNT + HELD_OUT}"}
-    facts = json.loads((written["lerobot"] / "meta/mimic.json").read_text())
+    facts = json.loads((written / "meta/mimic.json").read_text())
     assert (facts["control"], facts["checkpoint"], facts["env"]) == ("torque", 0, "planar4dof")
 
 
 def test_a_split_of_a_run(run_dir, written, tmp_path):
-    both, held_out = frames(written["lerobot"]), frames(write(tmp_path / "b", run=str(run_dir), split="held_out"))
+    both, held_out = frames(written), frames(write(tmp_path / "b", run=str(run_dir), split="held_out"))
     assert len(held_out["action"]) == HELD_OUT
     for name in ("observation.state", "action", "observation.environment_state"):
         np.testing.assert_array_equal(held_out[name], both[name][COUNT:])
@@ -119,7 +118,7 @@ def test_rollouts_as_bags_are_the_same(run_dir, written, tmp_path):
     text = run("dataset", f"run={run_dir}", f"out={out}", "format=rosbag2", "compilation_cache=")
     assert f"{COUNT + HELD_OUT} episodes ({COUNT} train, {HELD_OUT} held_out)" in text
     assert "commands: torque [N m]" in text and text.endswith(f"results: {out}\n")
-    columns = frames(written["lerobot"])
+    columns = frames(written)
     for episode in (0, COUNT):
         with AnyReader([out / f"episode_{episode:06d}"]) as reader:
             rows: list[tuple[str, Any]] = [
@@ -154,17 +153,15 @@ def test_a_gripper_comes_back_from_a_dataset(recorded, tmp_path, format):
     opening = 100 * np.random.default_rng(0).random((before.count, before.horizon + 1, 1))
     path = tmp_path / "gripper.npz"
     dataclasses.replace(before, torque=None, gripper=opening, gripper_names=("jaw",)).save(path)
-    after, _ = mimic.import_demonstrations(
-        write(tmp_path / "set", demonstrations=str(path), format=format), mimic.panda()
-    )
+    dataset = write(tmp_path / "set", demonstrations=str(path), format=format)
+    after, _ = mimic.import_demonstrations(dataset, mimic.panda())
     assert after.gripper_names == ("jaw",) and after.gripper is not None
     np.testing.assert_allclose(after.gripper, opening, atol=1e-5)  # percent in single precision
     np.testing.assert_allclose(after.qvel, before.qvel, rtol=0, atol=2e-7)
 
 
-@pytest.mark.parametrize(("format", "topic"), [("lerobot", "observation.state"), ("rosbag2", "/learner/joint_states")])
-def test_a_policys_motions_become_demonstrations(run_dir, written, format, topic):
-    dataset = written[format]
+def test_a_policys_motions_become_demonstrations(run_dir, written):
+    dataset, topic = written, "observation.state"
     learner = mimic.build_arm(environment().learner).embodiment
     free = np.full(2, np.inf)  # an untrained policy keeps no limits
     learner = dataclasses.replace(learner, joint_range=np.stack([-free, free], axis=1), velocity_limit=free)

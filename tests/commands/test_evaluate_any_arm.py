@@ -9,6 +9,8 @@ from mimic.commands.clips import prepare_clip
 from mimic.commands.config import EvaluateConfig, RenderConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.runs.checkpoints import save_checkpoint
+from mimic.trainers.config import PPOConfig, TrainConfig
+from mimic.trainers.run_config import save_config
 from tests.helpers.run_directories import write_run
 from tests.helpers.untrained_run import FAMILY, family, untrained_run
 
@@ -18,10 +20,16 @@ def run_dir(tmp_path_factory):
     return untrained_run(tmp_path_factory.mktemp("runs") / "run", family())
 
 
-@pytest.mark.slow_for(
-    "settings0-controller: expected policy or nearest_pose for all arms of a run of many, got pd; choose",
-    "settings5-panda_pair: expected a serial arm, got a tree of 2 chains",
-)
+@pytest.fixture(scope="module")
+def config_alone(tmp_path_factory):
+    """A run without networks: what it is rejected for is known from its config."""
+    folder = tmp_path_factory.mktemp("runs") / "config"
+    folder.mkdir()
+    save_config(folder, TrainConfig(family(), PPOConfig(preset="any_arm").resolve()))
+    save_checkpoint(folder, 1, {"weight": np.zeros(1, np.float32)})
+    return folder
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -34,8 +42,8 @@ def run_dir(tmp_path_factory):
         (["learner=panda_pair"], "panda_pair: expected a serial arm, got a tree of 2 chains"),
     ],
 )
-def test_what_many_arms_do_not_have_is_rejected(run_dir, reason, settings, message):
-    assert message in reason("evaluate", f"run={run_dir}", *settings)
+def test_what_many_arms_do_not_have_is_rejected(config_alone, reason, settings, message):
+    assert message in reason("evaluate", f"run={config_alone}", *settings)
 
 
 def test_a_run_of_one_learner_has_its_own(reason, tmp_path):
@@ -46,13 +54,15 @@ def test_a_run_of_one_learner_has_its_own(reason, tmp_path):
     )
 
 
-def test_a_view_rejects_many(run_dir, reason):
-    assert "expected an environment of one learner, got" in reason("view", f"run={run_dir}")
-
-
-def test_a_video_is_of_one_of_many_arms(run_dir, reason):
-    message = "learner: expected one arm for a run of many, env=panda_family, as in learner=panda locked=[2,4]"
-    assert message in reason("render", f"run={run_dir}")
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("view", "expected an environment of one learner, got"),
+        ("render", "learner: expected one arm for a run of many, env=panda_family, as in learner=panda locked=[2,4]"),
+    ],
+)
+def test_what_shows_one_arm_rejects_many(config_alone, reason, command, message):
+    assert message in reason(command, f"run={config_alone}")
 
 
 @pytest.mark.slow

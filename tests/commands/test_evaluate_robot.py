@@ -83,6 +83,7 @@ def evaluate(run_dir, out, **settings):
     return json.loads((out / "report.json").read_text())
 
 
+@pytest.mark.slow_for("mimic")
 @pytest.mark.parametrize("loop", ["mimic", "ruckig"])
 def test_a_policy_of_the_hardware_world(evaluation, tmp_path, capsys, loop):
     report = evaluation(tmp_path / "new", robot_loop=loop)
