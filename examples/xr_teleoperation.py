@@ -41,7 +41,7 @@ def drive(
         operator.engage()
     pose, gripper = (None, None) if hand is None else hand
     command = (recorder or operator).step(pose, gripper, None if sample is None else sample.time)
-    if operator.is_engaged and command.status.reason.endswith("jumped"):
+    if operator.is_engaged and "jumped" in command.status.reason:
         operator.disengage()  # as the headset's space was recentred: the next pose leads from where it is
     send(command)
 

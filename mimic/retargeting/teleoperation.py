@@ -31,7 +31,7 @@ _TOLERANCE = 1e-3, np.radians(0.5)  # m, rad: hands that are nearer count as rea
 _STEP_TIME, _MAX_STEPS = 0.015, 5  # s of a tick for each step of the posture, and steps at most
 _TIMEOUT = 0.2  # s without a sample, after which the follower is said to hold
 _FREE, _SPEED_TIME = 0.8, 0.03  # of the velocity limits: below, the path's speed counts, smoothed over this time [s]
-_APPROACH = 0.5  # of the velocity limits, on the way to another posture
+_APPROACH, _OVERTIME = 0.5, 1.25  # of the velocity limits, after `engage`; of the time that a posture is away
 _AHEAD = 0.05  # s, the shortest of the trajectories of which a tick takes the beginning
 _BRAKING = 0.5  # of twice the acceleration: what a joint needs to stop before its limit
 _GRIPPER_TIME = 0.25  # s at least from closed to open
@@ -175,6 +175,8 @@ class Teleoperator:
         self._speed, self._posture_rows, self._is_reached = np.zeros_like(self._path), None, True
         self._left = FAR
         self._is_near, self._stuck, self._searched, self._is_chosen = self._is_relative, 0.0, None, False
+        self._pace, self._time_left = 1.0 if self._is_relative else _APPROACH, np.inf
+        self._cost, self._allowed = 0.0, np.inf  # of the hand on the way to another branch
         self._held_apart = ""  # links of the follower that hold its posture back
 
     def disengage(self) -> None:
@@ -227,6 +229,8 @@ class Teleoperator:
         qpos = self._limiter.step(self._path, self._speed)
         rows = self._rows[1](np.array([self._posture, qpos]))
         self._posture_rows = rows[:1]
+        if not self._is_near:
+            self._cost = float(self._pose.cost(self._goal, rows[1:])[0])
         return FollowerCommand(qpos, opening, self._status(*self._pose.errors(self._goal, rows)))
 
     def _goal_of(self, sample: np.ndarray) -> Goal:
@@ -255,7 +259,10 @@ class Teleoperator:
         if self._waits():
             self._speed = 0 * self._speed
             return
+        self._limit_approach()
         reach, posture, rows, last = self._reach, self._posture[None], self._posture_rows, self._posture
+        if self._is_near:
+            reach = self._pace * reach
         lower, upper = np.maximum(self._lower, last - reach), np.minimum(self._upper, last + reach)
         self._held_apart = ""
         for _ in range(self._steps):
@@ -265,7 +272,7 @@ class Teleoperator:
             if near is not None:
                 posture = self._backed(before[0], posture[0], near)[None]
             rows = None
-        self._posture, follows = posture[0], self._path is last
+        self._posture = posture[0]
         moved = self._posture - last
         fraction = float(np.abs(moved / reach).max())
         # A path that goes as fast as it may ends at once, where the command must be able to stop, as one at a wall.
@@ -275,16 +282,41 @@ class Teleoperator:
         self._search(goal)
         if self._searched is not None and not self._is_near:
             return  # where an approach goes is not known yet
-        if not (follows and self._is_near):
-            moved = self._posture - self._path
-            fraction = float(np.abs(moved / reach).max()) / (1.0 if self._is_near else _APPROACH)
-            self._is_near |= fraction <= 1
-            moved /= max(fraction, 1.0)
-            near, walls = self._walls(self._path)
-            if self._hold_apart(near, walls, moved):  # it goes on from here, by steps that know the walls
-                self._posture, self._posture_rows, self._is_near = self._path, None, True
+        if self._is_near:
+            self._path = self._posture
+        else:
+            self._approach()
+
+    def _approach(self) -> None:
+        """Moves the path towards a posture that it has not reached."""
+        moved = self._posture - self._path
+        fraction = self._ticks_away(self._posture)
+        part = moved / max(fraction, 1.0) / self._steps
+        for _ in range(self._steps):
+            near, walls = self._walls(self._path, self._steps)
+            if self._hold_apart(near, walls, part):
+                self._follow_from_here()  # by steps that know the walls
                 return
-        self._path = self._posture if fraction <= 1 else self._path + moved
+            self._path = self._path + part
+        if fraction <= 1:
+            self._path, self._is_near = self._posture, True
+
+    def _ticks_away(self, posture: np.ndarray) -> float:
+        """Ticks that the path takes to a posture, at its pace."""
+        return float(np.abs((posture - self._path) / (self._pace * self._reach)).max())
+
+    def _limit_approach(self) -> None:
+        """Ends an approach when its time is over, or when the leader moved on so that the hand only loses by it."""
+        self._time_left -= self.period
+        is_over = self._time_left <= 0
+        if is_over or (self._is_near and self._is_reached):
+            self._pace = 1.0
+        if not self._is_near and (is_over or self._cost > self._allowed):
+            self._follow_from_here()
+
+    def _follow_from_here(self) -> None:
+        """Gives up the posture that the path has not reached."""
+        self._posture, self._posture_rows, self._is_near = self._path, None, True
 
     def _backed(self, before: np.ndarray, after: np.ndarray, near: Near) -> np.ndarray:
         """A step near walls, or a part of it that goes no deeper: walls may be curved."""
@@ -337,14 +369,22 @@ class Teleoperator:
         if found is None:
             return
         self._searched, self._stuck, self._is_chosen = None, 0.0, True
-        if not self._is_near or self._leads_there(goal, *found):
-            self._posture, self._posture_rows, self._is_near = found[0], None, False
+        posture = self._turned(found[0])
+        if not self._is_near or self._leads_there(goal, posture, found[1]):
+            self._posture, self._posture_rows, self._is_near = posture, None, False
+            self._time_left = _OVERTIME * self.period * self._ticks_away(posture)
+
+    def _turned(self, posture: np.ndarray) -> np.ndarray:
+        """The posture with each joint within half a turn from the path's, where its range has both."""
+        turned = posture - 2 * np.pi * np.round((posture - self._path) / (2 * np.pi))
+        return np.where((turned >= self._lower) & (turned <= self._upper), turned, posture)
 
     def _leads_there(self, goal: Goal, posture: np.ndarray, cost: float) -> bool:
         """Whether another branch is better, and the hand does not go away from its goal on the straight way there."""
         line = self._posture + np.linspace(0, 1, _LINE)[:, None] * (posture - self._posture)
         costs = self._pose.cost(goal, self._rows[1](line))
-        is_better = cost < 0.5 * costs[0] and costs.max() <= _DETOUR * costs[0]
+        self._allowed = _DETOUR * float(costs[0])
+        is_better = cost < 0.5 * costs[0] and costs.max() <= self._allowed
         return is_better and not (self._contacts and self._contacts.touch(line[1:]).any())
 
     def _status(self, positions: Sequence[float], rotations: Sequence[float]) -> TeleoperationStatus:
@@ -356,7 +396,7 @@ class Teleoperator:
         if self._samples.age > _TIMEOUT:
             return TeleoperationStatus("holding", reason or f"no sample for {self._samples.age:.1f} s", *errors)
         if not self._is_near:
-            return TeleoperationStatus("approaching", "on the way to a posture with this hand", *errors)
+            return TeleoperationStatus("approaching", reason or "on the way to a posture with this hand", *errors)
         if reached[1]:
             return TeleoperationStatus("tracking", reason, *errors)
         if reached[0]:
@@ -367,6 +407,7 @@ class Teleoperator:
         why = f"{names} at the limit" if names else "out of reach" if position > _TOLERANCE[0] else "rotation not free"
         why = f"{self._held_apart} would touch" if self._held_apart else why
         why = f"{why}: the nearest hand is {1e3 * position:.0f} mm and {np.degrees(rotation):.0f} deg away"
+        why = f"{reason}; {why}" if reason else why
         return TeleoperationStatus("nearest", why, *errors)
 
 

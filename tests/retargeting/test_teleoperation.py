@@ -203,6 +203,38 @@ def test_hand_out_of_reach_ends_at_the_nearest(arms):
     assert status.position_mm <= 1e3 * np.linalg.norm(hands - goal, axis=1).min() + 1
 
 
+def test_an_approach_ends_while_the_leader_moves_faster(arms):
+    """The leader goes round at almost the follower's speed; an approach at half of it would never arrive."""
+    operator = mimic.Teleoperator(*arms, rate=RATE, velocity=1.0)
+    operator.engage()
+    phase = 1.8 * np.arange(1000) / RATE
+    samples = np.tile(READY, (1000, 1))
+    samples[:, 0] += 0.5 * np.sin(phase)
+    samples[:, 3] += 0.5 * np.cos(phase)
+    commands, path = drive(operator, samples)
+    assert_within_limits(operator, path)
+    states = [command.status.state for command in commands]
+    assert states[50] == "approaching" and "approaching" not in states[600:]
+    assert max(command.status.position_mm for command in commands[900:]) < 120
+
+
+def test_the_first_approach_is_slow(arms):
+    operator = mimic.Teleoperator(*arms, rate=RATE)
+    operator.engage()
+    _, path = drive(operator, [READY + 2 * SWAY] * 300)
+    assert np.max(np.abs(np.diff(path, axis=0)) * RATE / operator.limits.velocity) <= 0.51
+
+
+def test_a_sample_that_jumps_is_told_where_the_hand_is_out_of_reach(arms):
+    operator = mimic.Teleoperator(*arms, hand="relative", rate=RATE)
+    operator.reset(operator.qpos)
+    operator.engage()
+    for x in np.linspace(0, 1, 100):
+        operator.step(READY + x * np.array([0.0, 1.5, 0.0, 2.5, 0.0, 0.0, 0.0]))
+    status = operator.step(READY - 1.5).status
+    assert status.state == "nearest" and "jumped" in status.reason and "nearest hand is" in status.reason
+
+
 def test_gripper_is_mapped_at_a_limited_speed(arms):
     operator = mimic.Teleoperator(*arms, hand="relative", rate=RATE, grippers=((10, 60), (0.0, 0.08)))
     operator.engage()
