@@ -11,7 +11,7 @@ import numpy as np
 
 from mimic.base.files import file_digest, read_json
 from mimic.base.npz import read_arrays
-from mimic.control.clearance import ClearanceConstants
+from mimic.control.clearance import ClearanceConstants, clearance
 from mimic.control.joint_control import MODES, PERIOD, JointParameters
 from mimic.control.limits import JointLimits
 
@@ -77,6 +77,11 @@ class Bundle:
     def periods(self) -> int:
         """Periods of the inner loop in a tick."""
         return round(self.control_dt / PERIOD)
+
+    def clearance_of(self, qpos: np.ndarray) -> np.ndarray:
+        """The clearance [rows] [m] of the arm in poses [rows, joints] [rad]; NaN where an angle is not finite."""
+        with np.errstate(invalid="ignore"):
+            return clearance(np.ascontiguousarray(qpos, np.float32), self.clearance)
 
     def motion_index(self, motion: int | str) -> int:
         """The index of a motion, by its name or its index.

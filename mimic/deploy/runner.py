@@ -12,7 +12,6 @@ import numpy as np
 
 from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import Bundle
-from mimic.deploy.clearance import Clearance
 from mimic.deploy.config import SafetyConfig
 from mimic.deploy.driver import Command, Driver, RobotAbort
 from mimic.deploy.policy import Policy
@@ -110,7 +109,7 @@ def run_controller(
       KeyboardInterrupt: Ctrl-C, after the arm has been stopped.
     """
     index = bundle.motion_index(motion)
-    layer = SafetyLayer(bundle, Clearance(bundle), config=config)
+    layer = SafetyLayer(bundle, config=config)
     run = _Run(driver, bundle, layer, policy or Policy(bundle, [index]), clock or WallClock())
     try:
         with _interrupts_noted(run):

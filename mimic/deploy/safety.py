@@ -54,9 +54,9 @@ class SafetyLayer:
 
     Args:
       bundle: the controller.
-      clearance: gives the clearance [rows] [m] of poses [rows, joints].
       robots: number of robots.
       config: thresholds.
+      clearance: gives the clearance [rows] [m] of poses [rows, joints]; that of the bundle where None.
 
     Attributes:
       cause: [robots] why the arm was stopped for good; empty while it is controlled.
@@ -69,11 +69,12 @@ class SafetyLayer:
     def __init__(
         self,
         bundle: Bundle,
-        clearance: Callable[[np.ndarray], np.ndarray],
         robots: int = 1,
         config: SafetyConfig | None = None,
+        clearance: Callable[[np.ndarray], np.ndarray] | None = None,
     ):
-        self._config, self._mode, self._clearance = config or SafetyConfig(), bundle.mode, clearance
+        self._config, self._mode = config or SafetyConfig(), bundle.mode
+        self._clearance = clearance or bundle.clearance_of
         check_supported(bundle.mode, bundle.control_dt, self._config)
         self._joints = JointParameters(*(np.tile(np.asarray(x, float)[:, None], robots) for x in bundle.parameters))
         scaled = self._joints._replace(

@@ -23,13 +23,9 @@ class ClipControls:
         _add_seek_button(server, self._session)
 
     def advance(self, dt: float) -> None:
-        """Moves the expert."""
-        pose, jumped = self._player.advance(dt)
-        _show(self._session, pose, jumped)
+        """Moves the expert, and updates the widgets."""
+        _show(self._session, *self._player.advance(dt))
         self._time_controls.update(dt)
-
-    def update(self) -> None:
-        """Does nothing: `advance` updates the widgets."""
 
 
 def _add_seek_button(server: viser.ViserServer, session: LiveSession) -> None:
@@ -59,7 +55,7 @@ class PointControls:
         _add_seek_button(server, self._session)
 
     def advance(self, dt: float) -> None:
-        """Moves the expert, and prints a line where the sender has stopped or started."""
+        """Moves the expert, updates the text, and prints a line where the sender has stopped or started."""
         if isinstance(self._tracker, HandTracker):
             goal = self._tracker.advance(dt, lambda: hand_poses(self._session.expert, self._session.pose)[0])
             if goal is not None:
@@ -70,9 +66,6 @@ class PointControls:
             self._state = self._tracker.state
             print(f"view: {self._state}", file=sys.stderr, flush=True)
         self._since_update += dt
-
-    def update(self) -> None:
-        """Updates the text."""
         if self._since_update > 0.5:
             self._since_update = 0.0
             self._text.content = self._content()

@@ -20,10 +20,7 @@ class ExpertControls(Protocol):
         """Adds the widgets."""
 
     def advance(self, dt: float) -> None:
-        """Moves the expert by a time step [s]."""
-
-    def update(self) -> None:
-        """Updates the widgets."""
+        """Moves the expert by a time step [s], and updates the widgets."""
 
 
 class LiveControls:

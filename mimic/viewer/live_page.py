@@ -45,7 +45,6 @@ def show_live(
             is_behind, since_numbers = False, 0.0
         elif frame is not None and changed:
             page.move(frame)
-        expert.update()
 
 
 def _note(frame: Frame, compiling: bool, by_optimiser: bool) -> str:

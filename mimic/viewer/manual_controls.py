@@ -45,13 +45,11 @@ class ManualControls:
             self._add_handle(server)
 
     def advance(self, dt: float) -> None:
-        """Does nothing: the session itself moves an expert along a demonstration."""
-
-    def update(self) -> None:
-        """Updates the sliders of an expert that moves by itself.
+        """Updates the sliders of an expert that the session moves, along a demonstration or by its hand.
 
         Otherwise the sliders are not set: a slider that the user drags is ahead of the session and would jump back.
         """
+        del dt
         self._move_handle()
         moving = self._session.moves_by_itself
         if moving or self._was_moving:

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import math
-import threading
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints
 from mimic.base import registry
+from mimic.base.compilation import Background, in_background
 from mimic.envs.config import EnvConfig
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import link_states
@@ -193,7 +193,7 @@ class FunctionCache:
     def __init__(self, env: EnvConfig, mapper: MapperOf | None = None):
         self._compile = functools.partial(compile_functions, env, mapper=mapper)
         self._results: dict[Any, CompiledFunctions | Exception] = {}
-        self._thread: threading.Thread | None = None
+        self._running: Background[None] | None = None
 
     def get(self, settings: Settings) -> CompiledFunctions | None:
         """The functions; None until those that move the learner are compiled.
@@ -201,13 +201,10 @@ class FunctionCache:
         Raises:
           ValueError: the locked joints are invalid.
         """
-        key = settings.compilation_key
-        if key not in self._results:
-            if self._thread is None or not self._thread.is_alive():
-                self._thread = threading.Thread(target=self._run, args=(key, settings), daemon=True, name="compile")
-                self._thread.start()
-            return None
-        result = self._results[key]
+        is_free = self._running is None or self._running.done  # asked first: what has ended has its result
+        result = self._results.get(settings.compilation_key)
+        if result is None and is_free:
+            self._running = in_background(functools.partial(self._run, settings))
         if isinstance(result, Exception):
             raise result
         return result
@@ -220,23 +217,22 @@ class FunctionCache:
     def wait(self, settings: Settings) -> CompiledFunctions:
         """Waits for all functions and returns them."""
         while (functions := self.get(settings)) is None or functions.best is None:
-            if self._thread is not None:
-                self._thread.join()
+            self.finish()
         return functions
 
     def finish(self) -> None:
         """Waits for a running compilation: a process must not end during it."""
-        if self._thread is not None:
-            self._thread.join()
+        if self._running is not None:
+            self._running()
 
-    def _run(self, key: Any, settings: Settings) -> None:
+    def _run(self, settings: Settings) -> None:
         while len(self._results) >= _MAX_COMPILED:
             del self._results[next(iter(self._results))]
         try:
             for functions in self._compile(settings):
-                self._results[key] = functions
+                self._results[settings.compilation_key] = functions
         except Exception as error:  # raised by `get`
-            self._results[key] = error
+            self._results[settings.compilation_key] = error
 
 
 def step_towards(

@@ -9,7 +9,6 @@ import pytest
 
 from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import load_bundle
-from mimic.deploy.clearance import Clearance
 from mimic.deploy.policy import Policy
 from tests.helpers import bundles
 
@@ -51,8 +50,7 @@ def test_a_policy_observes_what_it_was_exported_for(bundle, monkeypatch):
 
 
 def test_the_clearance_is_that_of_the_arm(bundle):
-    clearance = Clearance(bundle)
-    home, on_floor, folded = clearance(np.stack([bundle.start_pose, bundles.ON_FLOOR, bundles.FOLDED]))
+    home, on_floor, folded = bundle.clearance_of(np.stack([bundle.start_pose, bundles.ON_FLOOR, bundles.FOLDED]))
     assert 0.05 < home < 0.2 and on_floor < -0.1 and folded < -0.02
 
 

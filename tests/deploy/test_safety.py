@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from mimic.deploy import safety
-from mimic.deploy.clearance import Clearance
 from mimic.deploy.config import SafetyConfig
 from mimic.deploy.safety import COLLISION, INVALID, LATE, REPEATED, SafetyLayer, check_supported
 from tests.helpers import bundles
@@ -23,7 +22,7 @@ def bundle(tmp_path_factory):
 
 def started(bundle, clearance=None, config=CONFIG, robots=1, pose=None):
     """A layer of arms at rest in their start pose."""
-    layer = SafetyLayer(bundle, clearance or Clearance(bundle), robots, config)
+    layer = SafetyLayer(bundle, robots, config, clearance)
     qpos = np.tile((bundle.start_pose if pose is None else pose)[:, None], robots)
     assert set(layer.start(qpos, 0 * qpos, qpos)) == {""}
     return layer
@@ -144,7 +143,7 @@ def test_an_action_at_its_limit_may_round(layer):
 def test_a_path_towards_the_floor_is_not_taken(layer, bundle):
     """The arm stops in front of it at the margin, stays there, and can leave."""
     path = run(layer, velocity(1, 1.0), ticks=60)
-    clearance = Clearance(bundle)(path[:, 0])
+    clearance = bundle.clearance_of(path[:, 0])
     assert CONFIG.margin - CONFIG.creep < clearance.min() < CONFIG.margin + 0.05
     assert layer.counts[COLLISION][0] > 10 and np.abs(path[-1, 1]).max() < 1e-3
     assert layer.clearance[0] == pytest.approx(clearance.min(), abs=1e-3)  # measured once in a tick
@@ -195,7 +194,7 @@ def test_the_braking_path_of_a_target_is_the_one_that_was_checked(bundle):
         for _ in range(layer.brake_ticks):
             paths.append(run(layer, velocity(0, np.nan), present=False))
         path = np.concatenate(paths)
-        clearance = Clearance(bundle)(path[:, 0])
+        clearance = bundle.clearance_of(path[:, 0])
         assert np.all(path[-1, 1] == 0) and clearance.min() > CONFIG.margin - CONFIG.creep - 1e-6
 
 
@@ -211,7 +210,7 @@ STARTS = {
 
 @pytest.mark.parametrize(("change", "cause"), STARTS.values(), ids=STARTS)
 def test_it_starts_only_near_the_start_pose_and_at_rest(bundle, change, cause):
-    layer = SafetyLayer(bundle, Clearance(bundle))
+    layer = SafetyLayer(bundle)
     pose = bundle.start_pose[:, None]
     qpos, qvel, pose = change(pose, 0 * pose, pose)
     assert layer.start(qpos, qvel, pose)[0] == cause
@@ -221,7 +220,7 @@ def test_it_starts_only_near_the_start_pose_and_at_rest(bundle, change, cause):
 
 @pytest.mark.parametrize(("clearance", "cause"), [(0.0151, ""), (0.0149, safety.START_CLEARANCE)])
 def test_the_clearance_of_a_start(bundle, clearance, cause):
-    layer, pose = SafetyLayer(bundle, lambda rows: np.full(len(rows), clearance)), bundle.start_pose[:, None]
+    layer, pose = SafetyLayer(bundle, clearance=lambda rows: np.full(len(rows), clearance)), bundle.start_pose[:, None]
     assert layer.start(pose, 0 * pose, pose)[0] == cause
 
 
@@ -305,7 +304,7 @@ def test_scales_slow_the_reference_down(bundle):
 
 def test_torque_policies_and_other_ticks_are_rejected(bundle):
     with pytest.raises(ValueError, match="got torque"):
-        SafetyLayer(dataclasses.replace(bundle, mode="torque"), Clearance(bundle))
+        SafetyLayer(dataclasses.replace(bundle, mode="torque"))
     for control_dt, latency in ((0.02, 0.02), (0.055, 0.02), (0.05, 0.025)):
         with pytest.raises(ValueError, match=f"got {control_dt} s and {latency} s"):
             check_supported("joint_velocity", control_dt, SafetyConfig(latency=latency))

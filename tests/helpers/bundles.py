@@ -47,6 +47,7 @@ def parameters(locked: tuple[int, ...] = ()) -> JointParameters:
     return JointParameters(*(np.asarray(x, float) for x in plant.constants.parameters))
 
 
+@functools.cache
 def policy(joints: int, size: int, action: Any) -> bytes:
     """A policy as ONNX; `action` gives the action of the six inputs by name."""
     inputs = {name: joints for name in ("qpos", "qvel", "reference_qpos", "reference_qvel")}
@@ -67,6 +68,7 @@ def sine(values: dict[str, Any]) -> Any:
     return 0.4 * jnp.sin(phase + jnp.arange(values["qpos"].shape[0]))
 
 
+@functools.cache
 def constant(*numbers: float) -> Any:
     """The policy that always gives these numbers."""
     return lambda values: jnp.asarray(numbers, jnp.float32)

@@ -162,7 +162,7 @@ def test_the_page_has_a_handle_a_tab_and_goals(env):
         assert controls._hand.value == "exact"
         np.testing.assert_allclose(manual._handle.position, hand_poses(session.expert, session.pose)[0, :3, 3])
         session.move(1, 0.6)
-        manual.update()
+        manual.advance(0.1)
         np.testing.assert_allclose(manual._handle.position, hand_poses(session.expert, session.pose)[0, :3, 3])
         controls._place(3, 0.4)
         assert session.hand.base == (0, 0, 0, 0.4)

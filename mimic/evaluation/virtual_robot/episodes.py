@@ -8,7 +8,6 @@ import numpy as np
 
 from mimic.control.joint_control import PERIOD, Reference, action_towards
 from mimic.deploy.bundle import Bundle
-from mimic.deploy.clearance import Clearance
 from mimic.deploy.config import SafetyConfig
 from mimic.deploy.policy import Policy
 from mimic.deploy.runner import TickPolicy
@@ -153,7 +152,7 @@ class SafeController:
     ):
         config = config or SafetyConfig()
         self._policy = policy or Policy(bundle, motion.tolist())
-        self._layer = SafetyLayer(bundle, Clearance(bundle), len(motion), config)
+        self._layer = SafetyLayer(bundle, len(motion), config)
         self._channel = Channel(world, bundle.num_joints, seed)
         self.ticks, self.periods = bundle.ticks, bundle.periods
         self._latency, self._left, self._command = round(config.latency / PERIOD), -1, None

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from mimic.control.joint_control import Reference
-from mimic.deploy.clearance import Clearance
 from mimic.deploy.driver import Command
 from mimic.deploy.runner import run_controller
 from mimic.deploy.safety import COLLISION, LATE, REPEATED, SafetyLayer
@@ -108,7 +107,7 @@ def test_lockstep_is_a_robot_alone(bundle, loop):
 def test_a_robot_without_another_command_stops_where_its_path_was_checked(bundle, loop):
     """As where the program ends in the middle of a motion."""
     driver = VirtualRobot(bundle, loop)
-    layer, pose = SafetyLayer(bundle, Clearance(bundle)), bundle.start_pose[:, None]
+    layer, pose = SafetyLayer(bundle), bundle.start_pose[:, None]
     layer.start(pose, 0 * pose, pose)
     for tick in range(8):
         command = layer.tick(layer.reference.qpos, layer.reference.qvel, np.full((7, 1), 0.5))
