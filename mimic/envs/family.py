@@ -24,6 +24,8 @@ SEEN, UNSEEN = "seen", "unseen"
 _RANDOM_ARMS = 16  # in a report
 _RANDOM_SEED = 2**20  # of the random arms of a report; training draws from other keys
 
+_random_arms = jax.jit(jax.vmap(random_arm))
+
 
 def arms_config(config: EnvConfig) -> ArmsConfig:
     """What the learners of an environment are drawn from.
@@ -113,9 +115,7 @@ def report_arms(config: EnvConfig) -> dict[str, dict[str, ArmArrays]]:
                 raise ValueError(f"arms: expected models and evaluated of different names, got {short!r} twice")
             result[split][short] = _arrays(config, model)
     if arms.random_fraction:
-        drawn = jax.device_get(
-            jax.jit(jax.vmap(random_arm))(jax.random.split(jax.random.PRNGKey(_RANDOM_SEED), _RANDOM_ARMS))
-        )
+        drawn = jax.device_get(_random_arms(jax.random.split(jax.random.PRNGKey(_RANDOM_SEED), _RANDOM_ARMS)))
         for i in range(_RANDOM_ARMS):
             result[UNSEEN][f"random {i}"] = jax.tree.map(lambda x, i=i: x[i], drawn)
     return result

@@ -61,6 +61,7 @@ def test_the_kernel_and_its_gradient_equal_automatic_differentiation(x64):
     assert all(np.abs(gradient).max() > 1e-3 for gradient in both[0][1])
 
 
+@pytest.mark.slow_for("False")
 @pytest.mark.parametrize("as_data", [False, True])
 def test_the_derivatives_of_the_pose_search_equal_automatic_differentiation(x64, as_data):
     """1e-3: lengths are smoothed by 1e-3 chain lengths, which these poses are far from."""
