@@ -10,6 +10,9 @@ RUN is a run directory of `python -m mimic.train`; runs that differ in nothing b
   expert, from `python -m mimic.retarget`. The learner starts in the pose nearest to the first one of each.
 - long: 30 s of splines and of steps; the gap in the first and in the last 5 s.
 
+"whole_motion" is not a controller but a search: the torques of the policy's first seed, improved by iLQR with the whole
+motion and the exact dynamics known. It says how much of a gap there is to learn; better torques may exist.
+
 The interval is a 95 % hierarchical bootstrap over seeds and demonstrations. Centre line and hand are measures of
 similarity that nothing optimises, in chain lengths: means over all motions of a set, of the first seed.
 """
@@ -18,18 +21,26 @@ import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
+import jax
+import jax.numpy as jnp
 import mink
 import numpy as np
+from brax.envs.base import State
 
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect
 from mimic.arms.arm import Arm
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import to_dict
+from mimic.envs.arm_state import arm_state
 from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import recorded_demonstrations, test_demonstrations
+from mimic.evaluation.evaluator import Evaluator, Rollouts
+from mimic.evaluation.predictive_controller import DAMPING, improved, problem
 from mimic.evaluation.rollout_metrics import gap_interval, gaps
+from mimic.metric.kinematics import LinkStates
 from mimic.motions.demonstrations import Demonstrations, load_demonstrations
 from mimic.motions.experts import KINDS
 from mimic.runs.checkpoints import load_checkpoint
@@ -39,11 +50,12 @@ from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import load_config
 
 SETS = "test", "new", "long"
-CONTROLLERS = "copy_joints", "pd", "computed_torque", "one_step", "nearest_pose", "mpc"
+CONTROLLERS = "copy_joints", "pd", "computed_torque", "one_step", "nearest_pose", "mpc", "whole_motion"
 COLUMNS = "env set kind controller gap:.2% low:.2% high:.2% seeds demonstrations centre_line:.4f hand:.3f"
 LONG, WINDOW = 300, 50  # steps
 RADIUS, PERIOD = 0.08, 4.0  # m and s, of the circle
 AMPLITUDE = 0.4  # rad, of the figure of eight
+ITERATIONS, CHUNK = 60, 64  # of iLQR for a whole motion; motions at a time
 
 
 def circles(arm: Arm, count: int, horizon: int, dt: float) -> Demonstrations:
@@ -150,7 +162,10 @@ def rows(name: str, start: str, unseen: Demonstrations, policies: list[tuple[Pat
         windows = {", first 5 s": slice(0, WINDOW), ", last 5 s": slice(-WINDOW, None)}
     for controller in ("policy", *controllers):
         seeds = policies if controller == "policy" else policies[:1]
-        outcomes = [trainer.run_controller(controller, _params(trainer, path))[0] for path, _ in seeds]
+        if controller == "whole_motion":
+            outcomes = [whole_motion(evaluator, trainer.evaluate(_params(trainer, run)))]
+        else:
+            outcomes = [trainer.run_controller(controller, _params(trainer, path))[0] for path, _ in seeds]
         similarity = {
             key: float(x[part].mean()) for key, x in evaluator.similarity(np.asarray(outcomes[0].qpos)).items()
         }
@@ -167,6 +182,35 @@ def rows(name: str, start: str, unseen: Demonstrations, policies: list[tuple[Pat
                     "largest": float(np.nanmax(_gaps(distance, bound, hold)[:, of_kind])),
                     "centre_line": similarity["centre_line_distance"], "hand": similarity["hand_position_error"],
                 }  # fmt: skip
+
+
+def whole_motion(evaluator: Evaluator, rollouts: Rollouts) -> Rollouts:
+    """Rollouts whose torques are improved by iLQR over the whole motion."""
+    env = evaluator.env
+    advance, cost = problem(env, env.config.substeps)
+    expert = jax.tree.map(lambda x: x[:, 1 : env.config.horizon + 1], env.expert_states)
+    start = jnp.asarray(cast(Any, rollouts.start))
+    still = jnp.concatenate([start, jnp.zeros_like(start)], axis=1)
+
+    def of_motion(motion: tuple[Any, LinkStates, Any]) -> Any:
+        first, shown, actions = motion
+        weights = jnp.ones(len(actions))
+
+        def iterate(carry: tuple[Any, Any], _: None) -> tuple[tuple[Any, Any], None]:
+            before, damping = carry
+            after = improved(advance, cost, first, shown, weights, damping, before)
+            return (after, damping * jnp.where(jnp.all(after == before), 8.0, 0.5)), None
+
+        return jax.lax.scan(iterate, (actions, jnp.asarray(DAMPING)), None, length=ITERATIONS)[0][0]
+
+    motions = still, expert, rollouts.torque / env.torque_scale
+    actions = jax.jit(lambda x: jax.lax.map(of_motion, x, batch_size=CHUNK))(motions)
+
+    def play(state: State) -> Any:
+        arm = arm_state(state)
+        return actions[arm.demonstration, jnp.minimum(arm.step, actions.shape[1] - 1)]
+
+    return jax.jit(lambda: evaluator.rollout(play))()
 
 
 def _gaps(distance: np.ndarray, bound: np.ndarray, hold: np.ndarray) -> np.ndarray:

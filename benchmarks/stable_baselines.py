@@ -14,7 +14,7 @@ import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect
 from mimic.evaluation.evaluator import Controller, Evaluator
 from mimic.runs.files import REPORT
+from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo.trainer import run_environment
 from mimic.trainers.run_config import load_config
 
@@ -55,7 +56,12 @@ def learn(run: Path, steps: int) -> Row:
     torch.set_num_threads(1)
     config, report = load_config(run), json.loads((run / REPORT).read_text())
     env, held_out = run_environment(config.env, run)
-    options = {"n_steps": BATCH // ARMS, "gamma": config.trainer.discounting, "seed": config.seed, "device": "cpu"}
+    options = {
+        "n_steps": BATCH // ARMS,
+        "gamma": cast(PPOConfig, config.trainer).discounting,
+        "seed": config.seed,
+        "device": "cpu",
+    }
     began = time.perf_counter()
     model = PPO("MlpPolicy", Arms(VectorEnv(env, num_envs=ARMS)), **options).learn(steps)
     rate = model.num_timesteps / (time.perf_counter() - began)

@@ -22,8 +22,11 @@ _SUBSTEPS = 2  # of the model in a control step
 _ITERATIONS = 4  # from the last step's torques, moved on by a step
 _TRUST = 0.3  # in an extrapolated step, as a factor on the weight of the step before
 _EFFORT = 1e-5  # weight of a squared action; the metric has no weight for torques
-_DAMPING = 1e-4  # added to the curvature by actions
+DAMPING = 1e-4  # added to the curvature by actions
 _LINE_SEARCH = (1.0, 0.5, 0.2, 0.05, 0.0)  # fractions of a step
+
+Advance = Callable[[Array, Array], Array]  # (angles and velocities, action) -> those after a step
+Cost = Callable[[Array, LinkStates], Array]  # (angles and velocities, expert) -> distance
 
 
 def predictive_controller(env: ImitationEnv) -> ControllerWithMemory:
@@ -38,8 +41,36 @@ def predictive_controller(env: ImitationEnv) -> ControllerWithMemory:
     Args:
       env: the environment; its actions are torques, and its metric is differentiable twice.
     """
-    joints, preview = env.learner.num_joints, env.config.preview
-    model, dt = joints_of_model(env.arm.model), env.config.control_dt
+    preview, dt = env.config.preview, env.config.control_dt
+    advance, cost = problem(env, _SUBSTEPS)
+    horizon = preview + EXTRAPOLATED
+    trust = _TRUST ** jnp.maximum(0, jnp.arange(horizon) - preview + 1.0)
+
+    def start(state: State) -> Float[Array, "steps joints"]:
+        return jnp.zeros((horizon, env.learner.num_joints))
+
+    def act(state: State, actions: Array) -> tuple[Array, Array]:
+        arm = arm_state(state)
+        known = jax.vmap(env.expert_at, (None, 0))(arm.demonstration, arm.step + jnp.arange(preview + 1))
+        expert = ahead(known, dt)
+        first = jnp.concatenate([arm.qpos, arm.qvel])
+        improve = functools.partial(improved, advance, cost, first, expert, trust, DAMPING)
+        actions = jnp.concatenate([actions[1:], actions[-1:]])
+        actions, _ = jax.lax.scan(lambda x, _: (improve(x), None), actions, None, length=_ITERATIONS)
+        return actions[0], actions
+
+    return ControllerWithMemory(start, act)
+
+
+def problem(env: ImitationEnv, substeps: int) -> tuple[Advance, Cost]:
+    """The nominal dynamics of a control step, and the distance after it.
+
+    Args:
+      env: the environment.
+      substeps: steps of the model in a control step; those of the environment simulate what it does.
+    """
+    joints, model = env.learner.num_joints, joints_of_model(env.arm.model)
+    timestep = env.config.control_dt / substeps
 
     def advance(state: Array, action: Array) -> Array:
         torque = list(action * env.torque_scale)
@@ -47,25 +78,12 @@ def predictive_controller(env: ImitationEnv) -> ControllerWithMemory:
         def acceleration(qpos: Array, qvel: Array) -> Array:
             return jnp.stack(dynamics.acceleration(model, list(qpos), list(qvel), torque))
 
-        return jnp.concatenate(runge_kutta(acceleration, state[:joints], state[joints:], dt / _SUBSTEPS, _SUBSTEPS))
+        return jnp.concatenate(runge_kutta(acceleration, state[:joints], state[joints:], timestep, substeps))
 
     def cost(state: Array, expert: LinkStates) -> Array:
         return env.states_distance(expert, link_states(env.learner, state[:joints], state[joints:]))
 
-    def start(state: State) -> Float[Array, "steps joints"]:
-        return jnp.zeros((preview + EXTRAPOLATED, joints))
-
-    def act(state: State, actions: Array) -> tuple[Array, Array]:
-        arm = arm_state(state)
-        known = jax.vmap(env.expert_at, (None, 0))(arm.demonstration, arm.step + jnp.arange(preview + 1))
-        expert = ahead(known, dt)
-        first = jnp.concatenate([arm.qpos, arm.qvel])
-        improve = functools.partial(_improved, advance, cost, first, expert)
-        actions = jnp.concatenate([actions[1:], actions[-1:]])
-        actions, _ = jax.lax.scan(lambda x, _: (improve(x), None), actions, None, length=_ITERATIONS)
-        return actions[0], actions
-
-    return ControllerWithMemory(start, act)
+    return advance, cost
 
 
 def ahead(known: LinkStates, dt: float) -> LinkStates:
@@ -88,14 +106,26 @@ def ahead(known: LinkStates, dt: float) -> LinkStates:
 
 
 @jax.default_matmul_precision("highest")  # not TF32
-def _improved(
-    advance: Callable[[Array, Array], Array],
-    cost: Callable[[Array, LinkStates], Array],
+def improved(
+    advance: Advance,
+    cost: Cost,
     first: Float[Array, " states"],
     expert: LinkStates,
+    trust: Float[Array, " steps"],
+    damping: float | Float[Array, ""],
     actions: Float[Array, "steps joints"],
 ) -> Float[Array, "steps joints"]:
-    """Actions after one iteration of iLQR."""
+    """Actions after one iteration of iLQR; the same ones where none are better.
+
+    Args:
+      advance: see `problem`.
+      cost: likewise.
+      first: angles and velocities before the first step.
+      expert: [steps, links, 3] each, after each step.
+      trust: weight of each step.
+      damping: added to the curvature by actions.
+      actions: before.
+    """
 
     def roll(actions: Array) -> Array:
         return jax.lax.scan(lambda x, u: (advance(x, u), x), first, actions)[1]
@@ -103,7 +133,6 @@ def _improved(
     before = roll(actions)
     slopes = jax.vmap(jax.jacfwd(advance, argnums=(0, 1)))(before, actions)
     after = jax.vmap(advance)(before, actions)
-    trust = _TRUST ** jnp.maximum(0, jnp.arange(len(actions)) - len(actions) + 1.0 + EXTRAPOLATED)
     gradients = trust[:, None] * jax.vmap(jax.grad(cost))(after, expert)
     curvatures = trust[:, None, None] * _without_negative(jax.vmap(jax.hessian(cost))(after, expert))
 
@@ -111,7 +140,7 @@ def _improved(
         (by_state, by_action), gradient, curvature, action = step
         gradient, curvature = gradient + value[0], curvature + value[1]  # by the state after the step
         of_action = by_action.T @ gradient + 2 * _EFFORT * action
-        matrix = by_action.T @ curvature @ by_action + (2 * _EFFORT + _DAMPING) * jnp.eye(len(action))
+        matrix = by_action.T @ curvature @ by_action + (2 * _EFFORT + damping) * jnp.eye(len(action))
         mixed = by_action.T @ curvature @ by_state
         gains = -jnp.linalg.solve(matrix, jnp.column_stack([mixed, of_action]))
         feedback, change = gains[:, :-1], gains[:, -1]
