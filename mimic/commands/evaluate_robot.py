@@ -134,10 +134,10 @@ def _run(tasks: list[Task], console: Console) -> list[Episodes]:
 
 def _bundle(evaluator: Evaluator, run_dir: Path, steps: int, folder: Path) -> Path:
     """The policy as a bundle, with the motions of the evaluation."""
-    from mimic.trainers.export.export_controller import expert_table, export_controller
+    from mimic.trainers.export.export_controller import expert_table, prepare_controller
 
     bundle = folder / "bundle"
-    export_controller(run_dir, bundle, steps)
+    prepare_controller(run_dir, steps)(bundle)
     count = evaluator.env.demonstrations.count
     np.savez(  # the motions of the evaluation, in its order
         bundle / MOTIONS,

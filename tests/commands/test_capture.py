@@ -26,16 +26,24 @@ def printed_words(text, label, command):
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
+    """A short clip."""
+    path = tmp_path_factory.mktemp("clips") / "clip.bvh"
+    path.write_text(bvh_text(200))
+    return path
+
+
+@pytest.fixture(scope="module")
+def long_clip(tmp_path_factory):
     path = tmp_path_factory.mktemp("clips") / "clip.bvh"
     path.write_text(bvh_text(900))
     return path
 
 
 @pytest.fixture(scope="module")
-def written(clip):
+def written(long_clip):
     """Demonstrations of the left arm, and what the command printed."""
-    arguments = f"source={clip}", "arm=left", "out=left.npz", "env=panda7dof", "learner.locked=[7]"
-    return clip.parent, run("demonstrations", *arguments, folder=clip.parent)
+    arguments = f"source={long_clip}", "arm=left", "out=left.npz", "env=panda7dof", "learner.locked=[7]"
+    return long_clip.parent, run("demonstrations", *arguments, folder=long_clip.parent)
 
 
 @pytest.mark.slow
@@ -54,10 +62,10 @@ def test_demonstrations_fit_the_arm_that_is_written_with_them(written):
 
 
 @pytest.fixture(scope="module")
-def both(clip):
+def both(long_clip):
     """Demonstrations of both arms, and what the command printed."""
-    arguments = f"source={clip}", "arm=both", "out=both.npz", "env=bimanual"
-    return clip.parent, run("demonstrations", *arguments, folder=clip.parent)
+    arguments = f"source={long_clip}", "arm=both", "out=both.npz", "env=bimanual"
+    return long_clip.parent, run("demonstrations", *arguments, folder=long_clip.parent)
 
 
 @pytest.mark.slow

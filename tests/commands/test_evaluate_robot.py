@@ -64,8 +64,8 @@ def hardware_run(tmp_path_factory):
 def evaluation(hardware_run, monkeypatch):
     """A function that evaluates the run, whose controller was exported before."""
     run_dir, trainer, controller = hardware_run
-    copy = lambda run_dir, folder, steps: shutil.copytree(controller, folder)  # noqa: E731
-    monkeypatch.setattr("mimic.trainers.export.export_controller.export_controller", copy)
+    copy = lambda run_dir, steps: lambda folder: shutil.copytree(controller, folder)  # noqa: E731
+    monkeypatch.setattr("mimic.trainers.export.export_controller.prepare_controller", copy)
 
     def run(out, **settings):
         settings = {"robot": "virtual_panda", "episodes": 4, **settings}

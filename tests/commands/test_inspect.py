@@ -9,6 +9,7 @@ from PIL import Image
 
 import mimic
 from mimic.commands import arm_checks
+from mimic.commands import inspect as inspection_command
 from mimic.envs.config import EnvConfig
 from tests.helpers import original_model
 from tests.helpers.commands import run
@@ -21,7 +22,8 @@ def arm_file(tmp_path):
     return file
 
 
-def test_an_inspection_describes_the_arm(arm_file, tmp_path):
+def test_an_inspection_describes_the_arm(arm_file, tmp_path, monkeypatch):
+    monkeypatch.setattr(inspection_command, "_SCENE", (200, 160))  # pixels: the full size takes seconds on a CPU
     said = run("inspect", arm_file, "bound=false", f"out={tmp_path / 'out'}")
     for text in (
         "ur_like: 6 joints, 7 links",

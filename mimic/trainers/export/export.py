@@ -42,7 +42,7 @@ def export_run(
     Args:
       run: run directory.
       out: exported file; must not exist.
-      format: "onnx", or "controller", a folder for `mimic.deploy`, see `export_controller`.
+      format: "onnx", or "controller", a folder for `mimic.deploy`, see `prepare_controller`.
       learner: of a mapper to any arm, the arm that it maps to (see `ArmConfig.model`); the environment's where empty.
       locked: numbers or names of the joints of this arm that are locked.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.

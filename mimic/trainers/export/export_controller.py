@@ -31,22 +31,16 @@ from mimic.trainers.ppo.trainer import run_environment
 from mimic.trainers.run_config import load_config
 
 
-def export_controller(run_dir: Path, out: Path, checkpoint: int | None = None) -> None:
-    """Writes the controller of a run to a new folder, complete or not at all.
+def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable[[Path], None]:
+    """Restores a run; the returned function writes its controller to a new folder, complete or not at all.
 
     Args:
       run_dir: run directory of a policy with an inner loop (`env.control`, `world`).
-      out: must not exist.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
 
     Raises:
       ValueError: a run of another kind, one that the safety layer cannot run, or a checkpoint that does not exist.
     """
-    prepare_controller(run_dir, checkpoint)(out)
-
-
-def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable[[Path], None]:
-    """Restores a run; the returned function writes its controller, see `export_controller`."""
     trained = load_config(run_dir)
     config = trained.trainer
     if not isinstance(config, PPOConfig) or trained.env.kind != "inner_loop":
