@@ -40,6 +40,8 @@ def other_gripper(
     known = fraction[np.isfinite(fraction).all(axis=1)]
     if not len(known) or known.min() < -_SLACK or known.max() > 1 + _SLACK or np.ptp(known) < _USED:
         return None
+    if is_width and known.max() <= 0.5 + _SLACK and len(expert.names) == 2:
+        return None  # a width of which half is used, or one of the two fingers
     if is_width:
         return fraction * learner.travel
     at = np.minimum(np.arange(channels), len(learner.names) - 1)

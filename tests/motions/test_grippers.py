@@ -59,6 +59,7 @@ def test_hinges_may_close_at_the_end_far_from_zero(tmp_path):
         (FRACTION * 0.08, SLIDES, DRIVER, 0.8 * FRACTION),  # a width, and how far the other opens
         (-0.2 + 2 * FRACTION, JAW, DRIVER, 0.8 - 0.8 * FRACTION),
         (-0.2 + 2 * FRACTION, JAW, SLIDES, 0.04 * FRACTION),
+        (FRACTION * 0.04, SLIDES, DRIVER, None),  # half of a width, or a finger
         (100 * FRACTION, JAW, DRIVER, None),  # percent
         (2 * FRACTION - 1, SLIDES, DRIVER, None),  # robosuite's command
         (FRACTION * [0.04, -0.04], SLIDES, SLIDES, None),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.motions.formats.archives import read_archive
 from tests.helpers.commands import run
 
 TIME = np.arange(0, 6.0, 0.02)  # s
@@ -106,6 +107,14 @@ def test_locomujoco_files_are_split_and_their_free_joint_is_left_out(tmp_path):
     for which in range(2):
         np.testing.assert_allclose(imported.qpos[which], qpos, atol=1e-6)  # float32
         np.testing.assert_allclose(imported.qvel[which], qvel, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(600, 2, 3), (600,), (600, 6), (3, 3)])
+def test_an_array_of_no_single_hand_is_noted(tmp_path, shape):
+    """Such as of two hands: the joints are read nevertheless."""
+    recording = read_archive(archive(tmp_path / "loco.npz", hand_pos=np.zeros(shape)), mimic.panda().joint_names)
+    assert f"hand_pos has shape {list(shape)}, expected [600, 3]: not used" in recording.notes
+    assert all(motion.hand is None for motion in recording.motions.values())
 
 
 def test_joint_names_of_the_file_can_be_given(tmp_path):

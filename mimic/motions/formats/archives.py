@@ -17,7 +17,6 @@ _NUMBERS = "biuf"  # kinds of NumPy's types
 _FORMS = {  # of the arrays of an npz file: kinds of their types, and their numbers of dimensions
     "qpos": (_NUMBERS, (2,)), "qvel": (_NUMBERS, (2,)), "joint_names": ("U", (0, 1)), "frequency": (_NUMBERS, (0,)),
     "dt": (_NUMBERS, (0,)), "jnt_type": (_NUMBERS, (1,)), "split_points": (_NUMBERS, (0, 1)),
-    **dict.fromkeys(_HANDS, (_NUMBERS, (2,))),
 }  # fmt: skip
 
 
@@ -38,9 +37,6 @@ def read_archive(path: Path, joints: Sequence[str]) -> Recording:
             raise ValueError(
                 f"source: {key} in {str(path)!r} must be {expected} for its joints, got {list(values.shape)}"
             )
-    for key in filter(content.__contains__, _HANDS):
-        if content[key].shape[0] != len(qpos) or content[key].shape[1] < 3:
-            raise ValueError(f"source: {key} in {str(path)!r} must be [{len(qpos)}, 3], got {list(content[key].shape)}")
     rate = content["dt"] if "dt" in content else content["frequency"]
     if not 1 / MAX_VALUE <= float(rate) <= MAX_VALUE:
         raise ValueError(
@@ -48,13 +44,14 @@ def read_archive(path: Path, joints: Sequence[str]) -> Recording:
         )
     step = float(rate) if "dt" in content else 1 / float(rate)
     indices, gripper_at = ([present.index(name) for name in names] for names in (selection.joints, selection.gripper))
-    columns = np.asarray(qpos, float)
+    columns, notes = np.asarray(qpos, float), list(selection.notes)
+    hand = _hand(content, len(qpos), notes)
     motion = Motion(
         step * np.arange(len(qpos)),
         columns[:, angle_at[indices]],
         None if qvel is None else np.asarray(qvel, float)[:, velocity_at[indices]],
         columns[:, angle_at[gripper_at]] if gripper_at else None,
-        next((np.asarray(content[key], float)[:, :3] for key in _HANDS if key in content), None),
+        hand,
     )
     points = np.atleast_1d(content.get("split_points", (0, len(qpos))))
     bounds = [int(point) if np.isfinite(point) else -1 for point in points[: len(qpos) + 2]]
@@ -66,12 +63,24 @@ def read_archive(path: Path, joints: Sequence[str]) -> Recording:
         f"motion {number}": motion.take(slice(start, end))
         for number, (start, end) in enumerate(zip(bounds[:-1], bounds[1:], strict=True))
     }
-    return Recording(motions, notes=tuple(selection.notes), **selection.facts)
+    return Recording(motions, notes=tuple(notes), **selection.facts)
+
+
+def _hand(content: dict[str, Any], samples: int, notes: list[str]) -> np.ndarray | None:
+    """Positions [samples, 3] of the hand; None without them. A note says which arrays are none of a single hand."""
+    for key in filter(content.__contains__, _HANDS):
+        array = content[key]
+        if array.dtype.kind in _NUMBERS and array.shape in ((samples, 3), (samples, 7)):  # or poses
+            return np.asarray(array, float)[:, :3]
+        notes.append(f"{key} has shape {list(array.shape)}, expected [{samples}, 3]: not used")
+    return None
 
 
 def _npz_content(path: Path) -> dict[str, Any]:
     try:
-        content: dict[str, Any] = dict(read_arrays(path, _FORMS))  # not pickled ones, as LocoMuJoCo's metadata
+        content: dict[str, Any] = dict(
+            read_arrays(path, (*_FORMS, *_HANDS))
+        )  # not pickled ones, as LocoMuJoCo's metadata
     except ValueError as error:
         raise ValueError(f"source: {str(path)!r} cannot be read as an npz file of motions: {error}") from error
     lacking = [key for key in ("qpos", "joint_names") if key not in content]
@@ -82,8 +91,9 @@ def _npz_content(path: Path) -> dict[str, Any]:
             f"source: {str(path)!r} lacks {', '.join(lacking)}; expected qpos, joint_names, frequency or dt, and "
             "optionally qvel, jnt_type, split_points"
         )
-    for key, array in content.items():
-        kinds, dimensions = _FORMS[key]
+    for key, (kinds, dimensions) in _FORMS.items():
+        if (array := content.get(key)) is None:
+            continue
         if array.dtype.kind not in kinds or array.ndim not in dimensions:
             raise ValueError(
                 f"source: {key} in {str(path)!r} has type {array.dtype} and shape {list(array.shape)}; "

@@ -32,6 +32,7 @@ _HAND = re.compile(
     r"(?:.*[._/ ])?(?:eef|ee|tcp|hand|end_?effector|cartesian)(?:[._/ ]?(?:pos|position|positions|pose|state|xyz))?",
     re.I,
 )
+_HAND_JOINTS = re.compile(r"(?:.*[._/ ])?hand(?:[._/ ]?state)?", re.IGNORECASE)  # what numbered columns may be
 _PLACES = re.compile(r"(.*?)[._/ ]?([xyz]|[0-3])", re.IGNORECASE)  # of a hand: their names and axes
 
 
@@ -199,6 +200,7 @@ def hand_position(entries: Mapping[str, Sequence[str]]) -> tuple[str, list[str]]
     """The entry with positions of the hand, and the names of its three columns; None where no or several have them.
 
     The entry is called as hands are, as `eef_pos` or `ee_pose`, and has them first; or its columns are, as `tcp_x`.
+    Numbers without axes of a `hand` or a `hand_state` may be joints of fingers, and are left out.
     """
     found = []
     for entry, names in entries.items():
@@ -206,7 +208,9 @@ def hand_position(entries: Mapping[str, Sequence[str]]) -> tuple[str, list[str]]
         places = [
             (name, match[2].lower())
             for name in names
-            if (match := _PLACES.fullmatch(name)) and (_HAND.fullmatch(match[1]) or (is_hand and not match[1]))
+            if (match := _PLACES.fullmatch(name))
+            and (_HAND.fullmatch(match[1]) or (is_hand and not match[1]))
+            and not (match[2].isdigit() and _HAND_JOINTS.fullmatch(match[1] or entry))
         ]
         chosen = [name for axis in "xyz" for name, place in places if place == axis]
         if len(chosen) != 3 and len(places) >= 3:

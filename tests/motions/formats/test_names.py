@@ -3,7 +3,7 @@
 import pytest
 
 from mimic.motions.formats.episodes import ANGLE, TORQUE, VELOCITY
-from mimic.motions.formats.names import find_joints, parse_column, select
+from mimic.motions.formats.names import find_joints, hand_position, parse_column, select
 
 
 @pytest.mark.parametrize(
@@ -77,3 +77,18 @@ def test_what_was_measured_goes_before_what_was_commanded():
 )
 def test_the_gripper_of_the_joints_is_found(entries, joints, expected):
     assert select("set", entries, joints, "", "entry").gripper == expected
+
+
+@pytest.mark.parametrize(
+    ("entry", "names", "expected"),
+    [
+        ("eef_pos", ["0", "1", "2"], ["0", "1", "2"]),
+        ("ee_state", ["0", "1", "2", "3"], ["0", "1", "2"]),
+        ("hand_state", ["0", "1", "2", "3"], None),  # joints of fingers, perhaps
+        ("observation.hand", ["0", "1", "2"], None),
+        ("hand_state", ["x", "y", "z"], ["x", "y", "z"]),
+        ("s", ["hand_x", "hand_y", "hand_z", "a"], ["hand_x", "hand_y", "hand_z"]),
+    ],
+)
+def test_positions_of_the_hand_are_found(entry, names, expected):
+    assert hand_position({entry: names}) == (expected and (entry, expected))
