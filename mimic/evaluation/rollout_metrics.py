@@ -91,7 +91,7 @@ def speed_violations(arms: ArmArrays, qvel: Float[np.ndarray, "rows time joints"
     return (~is_slow & (np.asarray(arms.is_free)[:, None] > 0)).any(axis=-1).mean(axis=1)
 
 
-_centre_lines = jax.jit(jax.vmap(centre_line))  # compiled once for all tables of a report
+centre_lines = jax.jit(jax.vmap(centre_line))  # of the arm of each row; compiled once for all tables of a report
 
 
 def measure_similarity(
@@ -105,7 +105,7 @@ def measure_similarity(
       qpos: its joint angles at the same times [rad].
     """
     if isinstance(learner, ArmArrays):
-        line = jax.device_get(_centre_lines(learner, qpos))
+        line = jax.device_get(centre_lines(learner, qpos))
     else:
         line = centre_line_table(learner, qpos)
     return {name: value.mean(axis=1, dtype=float) for name, value in similarity(expert, line).items()}

@@ -2,12 +2,11 @@
 
 import jax
 import numpy as np
-import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import arm_arrays, stack_arms
 from mimic.evaluation.rollout_metrics import measure_similarity
-from mimic.metric.similarity import MEASURES, centre_line, centre_line_table, similarity
+from mimic.metric.similarity import MEASURES, centre_line_table
 from tests.helpers.array_cases import padded
 
 TIMES = 20
@@ -46,27 +45,17 @@ def cases():
     return result
 
 
-@pytest.fixture(scope="module")
-def batch():
-    """The cases, the Panda as their expert with its poses, and the measures [cases, T] of one compiled function."""
+def test_measures_are_those_of_the_embodiments():
+    """Of the Panda as the expert; each time is a row of one step."""
     arms = cases()
-    expert, expert_qpos = arms[0][0].astype(np.float32), random_poses(7, 10)
-
-    def of_arm(expert, arm, expert_qpos, qpos):
-        return similarity(centre_line(expert, expert_qpos), centre_line(arm, qpos))
-
-    measure = jax.jit(jax.vmap(of_arm, (None, 0, None, 0)))
-    learners = stack_arms([arm[0] for arm in arms]).astype(np.float32)
-    values = measure(expert, learners, wide(expert_qpos), np.stack([arm[1] for arm in arms]))
-    return arms, expert_qpos, jax.tree.map(np.asarray, values)
-
-
-def test_measures_are_those_of_the_embodiments(batch):
-    arms, expert_qpos, values = batch
+    line = centre_line_table(arms[0][2], random_poses(7, 10)[:, None])
+    rows = stack_arms([arm[0] for arm in arms for _ in range(TIMES)]).astype(np.float32)
+    lines = jax.tree.map(lambda x: np.concatenate([x] * len(arms)), line)
+    values = measure_similarity(lines, rows, np.concatenate([arm[1] for arm in arms])[:, None])
     assert set(values) == set(MEASURES)
-    line = centre_line_table(arms[0][2], expert_qpos[:, None])  # each time as a demonstration of one step
     for i, (_, _, embodiment, qpos) in enumerate(arms):
         expected = measure_similarity(line, embodiment, qpos[:, None])
         for name in MEASURES:
-            np.testing.assert_allclose(values[name][i], expected[name], rtol=0, atol=atol(name))
+            actual = values[name][i * TIMES : (i + 1) * TIMES]
+            np.testing.assert_allclose(actual, expected[name], rtol=0, atol=atol(name))
             assert np.ptp(expected[name]) > 100 * atol(name)

@@ -1,6 +1,6 @@
 """What a pose mapper is compared with: the optimum, random poses, and Newton steps without a network."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +10,6 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import ArmArrays
 from mimic.metric.kinematics import link_states
-from mimic.metric.similarity import centre_line, similarity
 from mimic.retargeting.pose import imitate_pose
 from mimic.trainers.pose_mapper.model import MapperModel, Params
 from mimic.trainers.pose_mapper.pair import Pair, Target, random_poses
@@ -192,19 +191,3 @@ def table_of_pairs(reference: Reference, mapped: Mapped) -> dict[str, Float[np.n
     }
     qualities = {name: (mean - optimum) / (random - optimum) for name, mean in means.items()}
     return {**qualities, "mean_distance": means[METHODS[0]], "optimal_distance": optimum, "random_distance": random}
-
-
-def mean_similarity(
-    pairs: Pairs, poses: Mapping[str, Float[Any, "pairs poses joints"]]
-) -> dict[str, dict[str, Float[np.ndarray, " pairs"]]]:
-    """Means over the learners' poses of the measures of `mimic.metric.similarity`, as {method: {measure: [pairs]}}."""
-
-    def of_pair(pair: Any) -> dict[str, Array]:
-        expert, learner, expert_qpos, qpos = pair
-        return similarity(centre_line(expert, expert_qpos), centre_line(learner, qpos))
-
-    measure = jax.jit(lambda qpos: jax.lax.map(of_pair, (*pairs, qpos)))
-    return {
-        name: {key: np.asarray(value).mean(axis=1, dtype=float) for key, value in measure(jnp.asarray(qpos)).items()}
-        for name, qpos in poses.items()
-    }

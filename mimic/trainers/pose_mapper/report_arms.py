@@ -13,9 +13,9 @@ from mimic.arms.sampler import Sampler
 from mimic.envs.config import EnvConfig
 from mimic.envs.family import SEEN, UNSEEN, arm_sampler
 from mimic.envs.family import report_arms as arms_of_report
-from mimic.evaluation.rollout_metrics import pose_similarity
+from mimic.evaluation.rollout_metrics import centre_lines, means_by_split, measure_similarity, pose_similarity
 from mimic.trainers.config import PoseMapperConfig
-from mimic.trainers.pose_mapper.evaluation import Mapped, Pairs, Reference, best_poses, mean_similarity
+from mimic.trainers.pose_mapper.evaluation import Mapped, Pairs, Reference, best_poses
 from mimic.trainers.pose_mapper.model import MapperModel
 from mimic.trainers.pose_mapper.pair import random_poses
 from mimic.trainers.trainer import Metrics
@@ -174,15 +174,8 @@ class ManyArms(ReportArms):
             "nearest_poses": best_poses(reference, mapped),
             "random_guesses": reference.guessed_qpos,
         }
-        few = slice(_SIMILARITY_POSES[1])
-        similarity = mean_similarity(
-            pairs._replace(expert_qpos=pairs.expert_qpos[:, few]),
-            {name: np.asarray(qpos)[:, few] for name, qpos in poses.items()},
-        )
-        return {
-            name: {
-                measure: {split: float(values[rows].mean()) for split, (rows, _) in self.splits.items()}
-                for measure, values in measures.items()
-            }
-            for name, measures in similarity.items()
-        }
+        few, learners = slice(_SIMILARITY_POSES[1]), pairs.learners
+        assert learners is not None
+        line = jax.device_get(centre_lines(pairs.experts, pairs.expert_qpos[:, few]))
+        tables = {name: measure_similarity(line, learners, qpos[:, few]) for name, qpos in poses.items()}
+        return means_by_split(tables, {split: rows for split, (rows, _) in self.splits.items()})
