@@ -12,7 +12,6 @@ and z up. A gap of more than half a second, or a jump, opens the clutch: the han
 
 import argparse
 import contextlib
-import importlib.util
 import time
 from collections.abc import Callable
 
@@ -20,7 +19,8 @@ import numpy as np
 
 import mimic
 from mimic.base.config import new_folder
-from mimic.motions.formats.episodes import package_error
+from mimic.base.distribution import import_extra
+from mimic.motions.formats.episodes import EXTRA
 from mimic.motions.mocap.point_socket import PointListener
 
 GAP = 0.5  # s
@@ -71,8 +71,7 @@ def main() -> None:
     try:
         if options.record:
             new_folder("record", options.record)
-            if importlib.util.find_spec("pyarrow") is None:
-                raise package_error("record", "pyarrow")
+            import_extra("pyarrow", EXTRA, "record")
         operator = follow_hand(options.arm, options.rate, options.velocity)
         if options.record:
             recorder = mimic.TeleoperationRecorder(operator)

@@ -1,6 +1,5 @@
 """`python -m mimic.dataset`: writes rollouts or demonstrations as a LeRobot dataset or as rosbag2."""
 
-import importlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,12 +9,12 @@ from rich.console import Console
 
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import check_unused, new_folder
-from mimic.base.distribution import NAME, VERSION
+from mimic.base.distribution import NAME, VERSION, import_extra
 from mimic.commands.config import DatasetConfig
 from mimic.commands.dataset_sources import file_episodes, rollout_episodes
 from mimic.evaluation.labels import SPLITS
 from mimic.motions.demonstrations import load_demonstrations
-from mimic.motions.formats.episodes import Episodes, package_error
+from mimic.motions.formats.episodes import EXTRA, Episodes
 from mimic.motions.formats.lerobot import action_of, frames_per_second, write_lerobot
 from mimic.motions.formats.rosbag2 import write_rosbag2
 from mimic.runs.checkpoints import load_checkpoint
@@ -36,7 +35,7 @@ def prepare_dataset(config: DatasetConfig) -> Callable[[], int]:
     use_compilation_cache(config.compilation_cache)
     _check_keys(config)
     out = new_folder("out", config.out)
-    _check_package(config.format)
+    import_extra(_PACKAGES[config.format], EXTRA, f"format={config.format}")
     compute = _prepare_rollouts(config) if config.run else _prepare_files(config)
 
     def run() -> int:
@@ -65,14 +64,6 @@ def _check_keys(config: DatasetConfig) -> None:
         check_unused(config, ("retargeted",), "with run=DIR")
     else:
         check_unused(config, ("checkpoint", "split"), "without run=DIR")
-
-
-def _check_package(format: str) -> None:
-    package = _PACKAGES[format]
-    try:
-        importlib.import_module(package)
-    except ImportError as error:
-        raise package_error(f"format={format}", package) from error
 
 
 _Computed = tuple[Episodes, list[str]]  # what to write, and what to tell about it

@@ -1,7 +1,6 @@
 """`python -m mimic.evaluate`: evaluates a run from a checkpoint, or another controller in place of its policy."""
 
 import dataclasses
-import importlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from rich.console import Console
 
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import new_folder
-from mimic.base.distribution import install_command
+from mimic.base.distribution import import_extra
 from mimic.commands.config import CONTROLLERS, EvaluateConfig
 from mimic.envs.config import EnvConfig
 from mimic.envs.family import with_one_learner
@@ -49,13 +48,8 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
 
 def _robot_evaluation(config: EvaluateConfig) -> Callable[[], None]:
     """An evaluation on virtual robots, see `prepare_robot_evaluation`."""
-    try:
-        for package in ("jax2onnx", "onnxruntime"):
-            importlib.import_module(package)
-    except ImportError as error:
-        raise ValueError(
-            f"robot: needs the packages jax2onnx and onnxruntime: {install_command('deploy,export')}"
-        ) from error
+    for package in ("jax2onnx", "onnxruntime"):
+        import_extra(package, "deploy,export", "robot:")
     from mimic.commands.evaluate_robot import prepare_robot_evaluation  # brax and MJX, which take seconds to import
 
     use_compilation_cache(config.compilation_cache)

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import importlib.util
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -15,7 +14,7 @@ from rich.console import Console
 
 from mimic.base import compat
 from mimic.base.config import new_folder
-from mimic.base.distribution import install_command
+from mimic.base.distribution import import_extra, install_command
 from mimic.commands.config import ViewConfig, base_numbers
 from mimic.commands.view_capture import (
     CapturedExpert,
@@ -31,7 +30,7 @@ from mimic.commands.view_server import check_port, is_installed, serve
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.motions.demonstrations import load_demonstrations
-from mimic.motions.formats.episodes import package_error
+from mimic.motions.formats.episodes import EXTRA
 from mimic.motions.mocap.live_hand import LiveHand
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.run_config import policy_run
@@ -64,8 +63,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     check_port(config.host, config.port)
     if config.record:
         new_folder("record", config.record)
-        if importlib.util.find_spec("pyarrow") is None:
-            raise package_error("record", "pyarrow")
+        import_extra("pyarrow", EXTRA, "record")
     from mimic.base.compilation import use_compilation_cache
 
     use_compilation_cache(config.compilation_cache)

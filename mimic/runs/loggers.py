@@ -1,13 +1,12 @@
 """Services that a run's metrics are sent to, in addition to its own files: Weights & Biases, MLflow."""
 
-import importlib
 import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from mimic.base.distribution import install_command
+from mimic.base.distribution import import_extra
 from mimic.base.files import read_text
 
 
@@ -83,12 +82,7 @@ def make_loggers(names: Sequence[str], run_dir: Path, config: Mapping[str, Any])
 
 
 def _package(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ValueError(
-            f"logger={name} needs the package {name}: {install_command(name)}; logger=local needs none"
-        ) from error
+    return import_extra(name, name, f"logger={name}")
 
 
 def _unless_set(variable: str, **value: str) -> dict[str, str]:

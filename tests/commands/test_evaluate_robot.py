@@ -233,4 +233,4 @@ def test_a_mapper_has_no_robot(reason, tmp_path):
 def test_missing_packages_are_named(reason, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     error = reason("evaluate", "run=runs/NAME", "robot=virtual_panda")
-    assert "robot: needs the packages jax2onnx and onnxruntime: pip install 'mimic-arms[deploy,export]'" in error
+    assert "robot: needs the package onnxruntime: pip install 'mimic-arms[deploy,export]'" in error

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from mimic.base.distribution import install_command
+from mimic.base.distribution import import_extra
 from mimic.control.joint_control import (
     PERIOD,
     JointParameters,
@@ -80,10 +80,7 @@ class RuckigMotion:
     """
 
     def __init__(self, limits: JointLimits, qpos: np.ndarray):
-        try:
-            import ruckig
-        except ImportError as error:
-            raise ValueError(f"robot_loop: needs the package ruckig: {install_command('deploy')}") from error
+        ruckig = import_extra("ruckig", "deploy", "robot_loop:")
         joints, robots = qpos.shape
         self._zero, self._command = [0.0] * joints, None
         self._ruckig = [ruckig.Ruckig(joints, PERIOD) for _ in range(robots)]

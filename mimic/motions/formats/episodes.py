@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mimic.base.distribution import install_command
-
 EXTRA = "datasets"  # of mimic: the packages that read and write these formats
 MAX_NUMBERS = 2**27  # that are read of a dataset: 1 GiB in double precision; seven joints for a day at 100 Hz
 EXPERT = "expert."  # before the names of the expert's joints, where they are beside the robot's
@@ -140,8 +138,3 @@ class Episodes:
             indices = list(group)
             found[split] = (indices[0], indices[-1] + 1)
         return found
-
-
-def package_error(what: str, package: str) -> ValueError:
-    """The error of a format whose package is not installed."""
-    return ValueError(f"{what} needs the package {package}: {install_command(EXTRA)}")

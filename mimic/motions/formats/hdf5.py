@@ -9,8 +9,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from mimic.base.distribution import import_extra
 from mimic.base.files import check_file, read_text
-from mimic.motions.formats.episodes import MAX_NUMBERS, Motion, Recording, package_error
+from mimic.motions.formats.episodes import EXTRA, MAX_NUMBERS, Motion, Recording
 from mimic.motions.formats.names import Selection, hand_position, parse_column, select
 from mimic.motions.formats.tables import TIMES, seconds
 
@@ -63,10 +64,7 @@ def read_hdf5(path: Path, joints: Sequence[str], entry: str = "", rate: float | 
     Raises:
       ValueError: a file that cannot be read, or that lacks the joints or their times.
     """
-    try:
-        import h5py
-    except ImportError as error:
-        raise package_error(f"source: {str(path)!r} is an HDF5 file, which", "h5py") from error
+    h5py = import_extra("h5py", EXTRA, f"source: {str(path)!r} is an HDF5 file, which")
     motions: dict[str, Motion] = {}
     selection, numbers, files = None, 0, files_of(path)
     for file in files:

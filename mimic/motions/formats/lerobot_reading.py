@@ -6,16 +6,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mimic.base.distribution import import_extra
 from mimic.base.files import check_file, read_json
 from mimic.motions.formats.episodes import (
     ANGLE,
     EXPERT,
+    EXTRA,
     MAX_NUMBERS,
     VELOCITY,
     Motion,
     Quantity,
     Recording,
-    package_error,
 )
 from mimic.motions.formats.lerobot import DATA_FOLDER, EPISODES_FOLDER, FINAL, INFO
 from mimic.motions.formats.names import UNITS, hand_position, parse_column, select
@@ -52,10 +53,7 @@ def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> Record
     Raises:
       ValueError: a folder that cannot be read, or that lacks the joints or has them in several features.
     """
-    try:
-        import pyarrow  # noqa: F401
-    except ImportError as error:
-        raise package_error(f"source: {str(path)!r} is a LeRobot dataset, which", "pyarrow") from error
+    import_extra("pyarrow", EXTRA, f"source: {str(path)!r} is a LeRobot dataset, which")
     try:
         info = read_json(path / INFO)
         fps, features = _check_info(info), _features(info["features"])

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from mimic.base.distribution import import_extra
 from mimic.base.files import check_file, check_folder
 from mimic.motions.formats.episodes import (
     ANGLE,
+    EXTRA,
     MAX_NUMBERS,
     TORQUE,
     VELOCITY,
@@ -19,7 +21,6 @@ from mimic.motions.formats.episodes import (
     Episodes,
     Motion,
     Recording,
-    package_error,
 )
 from mimic.motions.formats.names import Selection, select
 
@@ -154,10 +155,7 @@ def read_rosbag2(path: Path, joints: Sequence[str], topic: str = "") -> Recordin
     Raises:
       ValueError: a bag that cannot be read, or that lacks the joints or has them in several topics.
     """
-    try:
-        import rosbags  # noqa: F401
-    except ImportError as error:
-        raise package_error(f"source: {str(path)!r} is a rosbag2, which", "rosbags") from error
+    import_extra("rosbags", EXTRA, f"source: {str(path)!r} is a rosbag2, which")
     bags = _bags(path)
     if len(bags) > _MAX_BAGS:
         raise ValueError(f"source: {str(path)!r} has {len(bags):,} bags, expected at most {_MAX_BAGS:,}")

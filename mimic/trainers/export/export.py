@@ -1,6 +1,5 @@
 """`python -m mimic.export`: writes a trained policy or pose mapper to a file that runs without mimic."""
 
-import importlib
 import json
 import os
 from collections.abc import Callable, Sequence
@@ -11,7 +10,7 @@ from rich.console import Console
 
 from mimic.arms.arm import ArmConfig
 from mimic.base.config import check_choice, new_file, new_folder
-from mimic.base.distribution import install_command
+from mimic.base.distribution import import_extra
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.export.config import CONTROLLER, EXPORT_FORMATS, ExportConfig
@@ -106,10 +105,7 @@ def _run_dir(config: ExportConfig) -> Path:
 def _check_packages(format: str) -> None:
     """Raises a `ValueError` where a package that writes a format is not installed."""
     for package in _PACKAGES:
-        try:
-            importlib.import_module(package)
-        except ImportError as error:
-            raise ValueError(f"format={format} needs the package {package}: {install_command('export')}") from error
+        import_extra(package, "export", f"format={format}")
 
 
 def _exportable(config: ExportConfig) -> TrainConfig:
