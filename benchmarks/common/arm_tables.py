@@ -35,13 +35,18 @@ def any_arm_controller(cpu: Results, random: Results) -> list[Cells]:
     return rows
 
 
-def any_arm_specialists(specialists: Results) -> list[Cells]:
-    rows = specialists["rows"]
-    return [
-        ("held-out gap [%]", *(row["arm"] for row in rows)),
-        ("controller, no training", *(f"{100 * row['controller_gap']['held_out']:.1f}" for row in rows)),
-        ("PPO of this arm alone", *(f"{100 * row['gap']['held_out']:.1f}" for row in rows)),
-    ]
+def unseen_arms(results: Results) -> list[Cells]:
+    ways = {
+        "one policy that has not seen this arm": "unseen",
+        "one policy that has": "seen",
+        "controller, no training": "controller",
+        "PPO of this arm alone": "alone",
+    }
+    rows: list[Cells] = [("held-out gap [%]", *(row["arm"] for row in results["rows"]))]
+    for label, key in ways.items():
+        gaps = (row[key] for row in results["rows"])
+        rows.append((label, *("" if gap is None else f"{100 * gap:.1f}" for gap in gaps)))
+    return rows
 
 
 GROUPS = {

@@ -1,7 +1,6 @@
 """The pages' tables of poses and policies of one pair of arms: rows of cells, the header first."""
 
 import statistics
-from collections.abc import Sequence
 
 from benchmarks.common.cells import (
     ENVIRONMENTS,
@@ -52,20 +51,15 @@ def mapper_presets(mapper: Results) -> list[Cells]:
 # Dynamic imitation
 
 
-def simulations(study: Results, peer: Results) -> list[Cells]:
-    """Gaps of the paper's three simulations: default settings, the paper's, and stable-baselines3 with the paper's."""
-
-    def gap(gaps: Sequence[Results]) -> str:
+def simulations(paper: Results) -> list[Cells]:
+    """Gaps of the paper's three simulations in its setting, mean and standard deviation over the seeds."""
+    rows: list[Cells] = [("joints", "trained on", "training", "held out")]
+    cases = [("one_demonstration", "7 to 7", "1"), *((env, joints, "124") for env, joints in ENVIRONMENTS.items())]
+    for case, joints, count in cases:
+        gaps = [row["optimality_gap"] for row in where(paper["rows"], case=case)]
         splits = ([100 * of_seed[split] for of_seed in gaps] for split in ("train", "held_out"))
-        return " / ".join(f"{statistics.fmean(values):.2f} ± {statistics.stdev(values):.2f}" for values in splits)
-
-    rows: list[Cells] = [("joints", "trained on", "default", "the paper's", "stable-baselines3, the paper's")]
-    cases = [("one_demonstration", "7 to 7", "panda7dof", 1)]
-    cases += [(env, joints, env, 124) for env, joints in ENVIRONMENTS.items()]
-    for name, joints, env, count in cases:
-        ours = ([run["optimality_gap"] for run in study["results"][f"{name}{suffix}"]] for suffix in ("", "-paper"))
-        others = [row["gap"] for row in where(peer["rows"], env=env, demonstrations=count)]
-        rows.append((joints, f"{count}", *map(gap, ours), gap(others)))
+        cells = (f"{statistics.fmean(values):.2f} ± {statistics.stdev(values):.2f}" for values in splits)
+        rows.append((joints, count, *cells))
     return rows
 
 

@@ -1,12 +1,10 @@
 """Figures of docs/any_arm.md.
 
     python -m benchmarks.figures.any_arm controller RESULTS.json [MORE.json ...] OUT.png
-    python -m benchmarks.figures.any_arm policy POLICY.json OUTSIDE.json OUT.png
     python -m benchmarks.figures.any_arm mapper RESULTS.json OUT.png
 
-controller: the gap of the controller without training, for each arm and over the number of joints. policy: one policy
-for any arm, beside that controller and policies of one arm. mapper: how near a mapper to any arm comes to the optimum,
-over the number of distinct arms of its training.
+controller: the gap of the controller without training, for each arm and over the number of joints. mapper: how
+near a mapper to any arm comes to the optimum, over the number of distinct arms of its training.
 """
 
 import json
@@ -20,8 +18,7 @@ import numpy as np
 from benchmarks.figures.canvas import plt, save
 from mimic.evaluation.rollout_metrics import MIN_SPAN
 
-DARK, LIGHT, SPECIALIST = "#1f4e8c", "#9db8d9", "#c2410c"
-FLOOR = 0.05  # %, the lowest gap of a policy that is shown
+DARK, LIGHT = "#1f4e8c", "#9db8d9"
 GROUPS = {"unseen locks": "#1f4e8c", "real arms": "#c2410c", "random arms": "#4d7c0f"}
 SERIES = {
     "quality": ("with four Newton steps", "-", 1.0),
@@ -34,8 +31,7 @@ def draw_controller(results: dict[str, Any], out: Path) -> None:
     """Draws the arms with names as bars, and the random arms as points.
 
     Args:
-      results: rows by kind of arm, as `benchmarks.any_arm` writes them; `report`: more random arms, those of reports;
-        and `rows`: gaps of policies of one arm.
+      results: rows by kind of arm, as `benchmarks.any_arm` writes them; `report`: more random arms, those of reports.
       out: image file.
     """
     named = [row for kind in ("presets", "locks", "real") for row in results.get(kind, []) if row["span"] >= MIN_SPAN]
@@ -44,11 +40,6 @@ def draw_controller(results: dict[str, Any], out: Path) -> None:
     places = np.arange(len(named))
     left.bar(places, [100 * row["gap"] for row in named], color=LIGHT, label="whole episode")
     left.bar(places, [100 * row["late"] for row in named], width=0.4, color=DARK, label="second half")
-    specialists = {row["arm"]: 100 * row["gap"]["held_out"] for row in results.get("rows", [])}
-    shown = [place for place, row in zip(places, named, strict=True) if row["arm"] in specialists]
-    if shown:
-        gaps = [specialists[named[place]["arm"]] for place in shown]
-        left.plot(shown, gaps, "_", color=SPECIALIST, markersize=14, markeredgewidth=2, label="PPO of this arm alone")
     left.set_xticks(places, [row["arm"] for row in named], rotation=90, fontsize=8)
     left.set(ylabel="optimality gap [%]", title="Locked joints of the Panda, and real arms")
     left.legend(frameon=False)
@@ -62,63 +53,6 @@ def draw_controller(results: dict[str, Any], out: Path) -> None:
     right.set(yscale="log", xlabel="joints", title="Random arms, and their medians")
     right.legend(frameon=False)
     save(figure, out)
-
-
-def draw_policy(
-    rows: Sequence[Mapping[str, Any]],
-    outside: Sequence[Mapping[str, Any]],
-    out: Path,
-) -> None:
-    """Draws arms with a specialist on the left; random arms by joints, and arms outside the distribution, on the right.
-
-    Args:
-      rows: gaps of arms, `controller_gap` and `seed_0` to `seed_2`, with the number of `joints`; `specialist_gap` of
-        the policy of this arm alone, where there is one.
-      outside: the same of arms outside the distribution, with one seed.
-      out: image file.
-    """
-    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4.5), width_ratios=[1.5, 1], layout="constrained")
-    own = [row for row in rows if "specialist_gap" in row]
-    own.sort(key=lambda row: (not row["arm"].startswith("locked"), row["seen"], _mean(row)))
-    _points(left, range(len(own)), own)
-    gaps = [_percent(row["specialist_gap"]) for row in own]
-    left.plot(range(len(own)), gaps, "_", color=SPECIALIST, markersize=14, markeredgewidth=2, label="PPO of this arm")
-    labels = [row["arm"] + (" (seen)" if row["seen"] else "") for row in own]
-    left.set_xticks(range(len(own)), labels, rotation=90, fontsize=8)
-    left.set(yscale="log", ylabel="optimality gap [%]", title="Locked joints of the Panda, and real arms")
-    left.legend(frameon=False)
-    random = [row for row in rows if row["arm"].startswith("random")]
-    places = np.array([row["joints"] for row in random]) + np.linspace(-0.25, 0.25, len(random))
-    first = 10  # place of the first arm outside of the distribution
-    _points(right, [*places, *range(first, first + len(outside))], [*random, *outside])
-    right.set_xticks(
-        [*range(4, 9), *range(first, first + len(outside))],
-        [*(f"{joints} joints" for joints in range(4, 9)), *(row["arm"].replace("_", " ") for row in outside)],
-        rotation=90,
-        fontsize=8,
-    )
-    right.axvline(first - 1, color="gray", linewidth=0.5)
-    right.set(yscale="log", title="Random arms, and arms outside of their distribution")
-    save(figure, out)
-
-
-def _points(axes: Any, places: Any, rows: Sequence[Mapping[str, Any]]) -> None:
-    axes.plot(
-        places,
-        [_percent(row["controller_gap"]) for row in rows],
-        "o",
-        color=LIGHT,
-        label="controller, no training",
-    )
-    axes.plot(places, [_percent(_mean(row)) for row in rows], ".", color=DARK, label="one policy for all arms")
-
-
-def _mean(row: Mapping[str, Any]) -> float:
-    return float(np.mean([value for key, value in row.items() if key.startswith("seed_")]))
-
-
-def _percent(gap: float) -> float:
-    return max(100 * gap, FLOOR)
 
 
 def draw_mapper(rows: Sequence[Mapping[str, Any]], out: Path) -> None:
@@ -151,13 +85,10 @@ def main() -> None:
     results = [json.loads(Path(file).read_text()) for file in files]
     if kind == "controller":
         draw_controller({key: value for content in results for key, value in content.items()}, Path(out))
-    elif kind == "policy":
-        policy, outside = ([row for row in content["arms"] if row["controller_gap"] is not None] for content in results)
-        draw_policy(policy, outside, Path(out))
     elif kind == "mapper":
         draw_mapper(results[0]["rows"], Path(out))
     else:
-        sys.exit(f"expected controller, policy or mapper, got {kind!r}")
+        sys.exit(f"expected controller or mapper, got {kind!r}")
 
 
 if __name__ == "__main__":
