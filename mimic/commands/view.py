@@ -150,7 +150,7 @@ def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
         mapper.to(env.learner)
         return _prepare_live(config, env, LiveSession(env, lambda learner: mapper.to(learner).nearest))
     if config.env.learner != env_config(_DEFAULT).learner:
-        raise ValueError(f"learner: expected none with mapper={config.mapper}, which has one learner")
+        raise ValueError(f"env, learner: expected neither with mapper={config.mapper}, which has one learner")
     return _prepare_live(config, mapper.env, LiveSession(mapper.env, lambda learner: mapper, can_lock=False))
 
 

@@ -34,7 +34,7 @@ from tests.helpers.bodies import bvh_text, person
         (["run=a", "mapper=b"], "expected one of them"),
         (["mapper=any_arm", "expert=panda"], "expert: expected none with mapper=, which brings its own"),
         (["run=a", "learner=panda"], "learner: expected none with run=, which brings its own"),
-        (["mapper=planar4dof", "learner=panda"], "learner: expected none with mapper=planar4dof, which has one"),
+        (["mapper=planar4dof", "learner=panda"], "env, learner: expected neither with mapper=planar4dof, which"),
         (["mapper=any_arm", "checkpoint=5"], "checkpoint: expected none with mapper=any_arm, which comes with mimic"),
         (["mapper=any_arm", "learner=bimanual"], "expected a serial arm, got a tree of 2 chains"),
         (["hand=near"], "hand: expected one of free, exact, relative, got 'near'"),
