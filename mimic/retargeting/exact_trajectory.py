@@ -10,7 +10,9 @@ JAX computes chunks of a fixed number of times, so that motions of all lengths s
 """
 
 import functools
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -34,6 +36,7 @@ from mimic.retargeting.pose import PoseImitation, shared_joints, wrap_angles
 
 SPACING, SEGMENTS = 16, CHUNK // 16  # times from one anchor to the next, and such segments in a chunk
 _BRANCHES = 9  # at each anchor
+_THREADS = 8  # at most, each with a chunk
 _STEPS, _DAMPING = 4, 1e-3  # Newton's method from the neighbouring time
 _SLACK = 0.95  # of the maximum change for candidates, which are finished afterwards
 _LEAP = 1.001  # of the maximum change: a path that changes by more passes to another branch
@@ -70,7 +73,10 @@ def exact_trajectory(
     """The motion; see `imitate_trajectory`."""
     arms, times = (expert, learner, metric, costs, capsules), len(poses)
     candidates_of = _candidates(*arms)
-    chunks = [candidates_of(x, base, random, jump) for x in in_chunks(poses, CHUNK + 1, 1)]
+    first, *others = in_chunks(poses, CHUNK + 1, 1)
+    chunks = [candidates_of(first, base, random, jump)]  # which compiles
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as pool:
+        chunks += pool.map(lambda x: jax.block_until_ready(candidates_of(x, base, random, jump)), others)
     candidates = Candidates(*(np.concatenate(jax.device_get(part))[:times] for part in zip(*chunks, strict=True)))
     continuous, ranges = continuous_joints(learner), np.asarray(learner.joint_range)
     report = hand_report(*arms)
@@ -88,8 +94,11 @@ def exact_trajectory(
         return qpos, *by_chunks(lambda x, qpos: report(x, base, qpos), poses, qpos)
 
     costs_of_step = (_PER_STEP, _INEXACT) if is_redundant else (_INEXACT,)
-    best = {path.tobytes(): path for path in (best_path(candidates, jump, continuous, x) for x in costs_of_step)}
-    paths = [realized(path) for path in best.values()]
+    paths: list[tuple[np.ndarray, ...]] = []
+    for cost_of_step in costs_of_step:
+        paths.append(realized(best_path(candidates, jump, continuous, cost_of_step)))
+        if is_exact(*paths[-1][2:]).all():  # and, with the lower cost, of the lower distance
+            break
     qpos, distance, position, rotation = max(paths, key=lambda path: (is_exact(*path[2:]).sum(), -path[1].mean()))
     lower, upper = motion_limits(learner)
     inside = (qpos >= lower - 1e-6) & (qpos <= upper + 1e-6)
