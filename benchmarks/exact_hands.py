@@ -102,16 +102,6 @@ def errors(arm: Embodiment, qpos: np.ndarray, targets: np.ndarray) -> tuple[np.n
     return np.linalg.norm(apart[..., :3, 3], axis=-1), 2 * np.arcsin(np.minimum(chord, 1))
 
 
-def jacobians(arm: Embodiment, qpos: np.ndarray) -> np.ndarray:
-    """Velocities [..., 6, joints] of the hand, linear [m] and angular, for each joint's."""
-    hand, columns, before = hand_matrices(arm, qpos)[..., :3, 3], [], np.eye(4)
-    for motion, axis, anchor in zip(joint_motions(arm, qpos), arm.joint_axis, arm.joint_anchor, strict=True):
-        axis, origin = motion[..., :3, :3] @ axis, (before @ np.append(anchor, 1))[..., :3]
-        columns.append(np.concatenate([np.cross(axis, hand - origin), axis], axis=-1))
-        before = motion
-    return np.stack(columns, axis=-1)
-
-
 def ssik_solver(arm: Embodiment) -> tuple[Any, np.ndarray]:
     """ssik's arm, and the rotation from its hand to ours."""
     import ssik

@@ -46,7 +46,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.common import measured_code
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
-from benchmarks.exact_hands import SPEEDS, all_postures, as_numbers, followed_by_ssik, homogeneous, jacobians
+from benchmarks.exact_hands import SPEEDS, all_postures, as_numbers, followed_by_ssik, homogeneous
 from benchmarks.teleoperation import BASE, SPEED, arm, hand_errors, recordings
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.compile_check import VELOCITY_LIMIT
@@ -56,6 +56,7 @@ from mimic.commands.retarget import prepare_retargeting
 from mimic.envs.config import EnvConfig
 from mimic.motions.importing import read_source
 from mimic.motions.units import in_rad
+from mimic.retargeting.hand_speeds import hand_jacobians
 from mimic.retargeting.hand_target import placement
 
 ARMS = "ur5e", "iiwa14", "gen3", "jaco", "xarm7"
@@ -193,7 +194,7 @@ def failing_rows(options: argparse.Namespace, expert: Model, row: Row) -> Iterat
             postures, (now, then) = postures_of(hands[frame]), hands[frame : frame + 2]
             turn = Rotation.from_matrix(then[:3, :3] @ now[:3, :3].T).as_rotvec()
             twist = np.concatenate([then[:3, 3] - now[:3, 3], turn]) / dt
-            speed = least_speed(jacobians(arm, postures), twist, limits) if len(postures) else np.inf
+            speed = least_speed(hand_jacobians(arm, postures)[:, 0], twist, limits) if len(postures) else np.inf
             found.append((speed, frame, len(postures)))
         speed, frame, count = max(found)
         needs = {"frame": frame, "postures": count, "speed": speed if count else None}
