@@ -64,11 +64,13 @@ class TimeControls:
     def update(self, dt: float) -> None:
         """Updates the widgets after a time step [s]."""
         self._since_update += dt
-        if self._since_update > 1 / _SCRUB_RATE and self._timeline.is_playing:
+        is_playing = self._timeline.is_playing
+        label = "pause" if is_playing else "play"
+        has_changed = self._button.label != label
+        if has_changed or (is_playing and self._since_update > 1 / _SCRUB_RATE):
             self._since_update = 0.0
             self._scrub.value = round(min(self._timeline.time, self._scrub.max), 2)
-        label = "pause" if self._timeline.is_playing else "play"
-        if self._button.label != label:
+        if has_changed:
             self._button.label = label
 
     def _set_playing(self, playing: bool) -> None:
@@ -78,5 +80,5 @@ class TimeControls:
 
     def _scrubbed(self, event: Any) -> None:
         if event.client is not None:  # the user moved it, not `update`
+            self._timeline.go_to(float(event.target.value))  # first: `update` then shows this time
             self._timeline.is_playing = False
-            self._timeline.go_to(float(event.target.value))

@@ -109,11 +109,14 @@ def test_locomujoco_files_are_split_and_their_free_joint_is_left_out(tmp_path):
         np.testing.assert_allclose(imported.qvel[which], qvel, atol=1e-5)
 
 
-@pytest.mark.parametrize("shape", [(600, 2, 3), (600,), (600, 6), (3, 3)])
-def test_an_array_of_no_single_hand_is_noted(tmp_path, shape):
-    """Such as of two hands: the joints are read nevertheless."""
-    recording = read_archive(archive(tmp_path / "loco.npz", hand_pos=np.zeros(shape)), mimic.panda().joint_names)
-    assert f"hand_pos has shape {list(shape)}, expected [600, 3]: not used" in recording.notes
+@pytest.mark.parametrize(
+    ("shape", "kind"), [((600, 2, 3), "float64"), ((600,), "float64"), ((600, 6), "float64"), ((600, 3), "<U3")]
+)
+def test_an_array_of_no_single_hand_is_noted(tmp_path, shape, kind):
+    """Such as of two hands, or text: the joints are read nevertheless."""
+    source = archive(tmp_path / "loco.npz", hand_pos=np.zeros(shape, kind))
+    recording = read_archive(source, mimic.panda().joint_names)
+    assert f"hand_pos: expected numbers [600, 3], got {kind} {list(shape)}: not used" in recording.notes
     assert all(motion.hand is None for motion in recording.motions.values())
 
 

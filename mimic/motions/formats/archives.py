@@ -72,7 +72,7 @@ def _hand(content: dict[str, Any], samples: int, notes: list[str]) -> np.ndarray
         array = content[key]
         if array.dtype.kind in _NUMBERS and array.shape in ((samples, 3), (samples, 7)):  # or poses
             return np.asarray(array, float)[:, :3]
-        notes.append(f"{key} has shape {list(array.shape)}, expected [{samples}, 3]: not used")
+        notes.append(f"{key}: expected numbers [{samples}, 3], got {array.dtype} {list(array.shape)}: not used")
     return None
 
 
