@@ -1,8 +1,7 @@
 """Live teleoperation: a leader arm, a person or a hand drives a follower of another embodiment, tick by tick.
 
-Each tick has three stages. A sample of the leader is checked, and gives a goal of the follower's hand. The posture
-takes steps to this goal within the velocity limits, see `mimic.retargeting.live_pose`; it never jumps to another
-branch. The command follows the posture by Ruckig's online trajectories, within all limits and always able to stop.
+In each tick a sample of the leader is checked, see `mimic.retargeting.leaders`. It gives a goal of the follower's hand,
+to which the follower moves within its limits, see `mimic.retargeting.live_follower`.
 """
 
 import functools
@@ -16,31 +15,19 @@ from jaxtyping import Float
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.base.config import check_choice
-from mimic.base.distribution import install_command
-from mimic.control.limits import JointLimits, joint_limits
+from mimic.control.limits import JointLimits
 from mimic.metric.config import MetricConfig
-from mimic.retargeting.branch_search import BranchSearch
+from mimic.retargeting.follower_limits import Gripper, follower_limits
 from mimic.retargeting.hand_target import matched_hands, placement
-from mimic.retargeting.leaders import ArmLeader, HandLeader, Samples
-from mimic.retargeting.live_pose import FAR, NEAR, ArmRows, Goal, LivePose
-from mimic.retargeting.self_contacts import Near, SelfContacts
+from mimic.retargeting.leaders import ArmLeader, HandLeader, Samples, Way
+from mimic.retargeting.live_follower import REACHED, LiveFollower
+from mimic.retargeting.live_pose import ArmRows, Goal, LivePose
+from mimic.retargeting.self_contacts import SelfContacts
 
 HANDS = ("exact", "relative")
 STATES = ("tracking", "nearest", "catching up", "approaching", "holding", "waiting", "disengaged")
-_TOLERANCE = 1e-3, np.radians(0.5)  # m, rad: hands that are nearer count as reached
-_STEP_TIME, _MAX_STEPS = 0.015, 5  # s of a tick for each step of the posture, and steps at most
 _TIMEOUT = 0.2  # s without a sample, after which the follower is said to hold
-_FREE, _SPEED_TIME = 0.8, 0.03  # of the velocity limits: below, the path's speed counts, smoothed over this time [s]
-_APPROACH, _OVERTIME = 0.5, 1.25  # of the velocity limits, after `engage`; of the time that a posture is away
-_AHEAD = 0.05  # s, the shortest of the trajectories of which a tick takes the beginning
-_BRAKING = 0.5  # of twice the acceleration: what a joint needs to stop before its limit
-_GRIPPER_TIME = 0.25  # s at least from closed to open
-_STUCK = 0.3  # s with a hand that is not reached, after which another branch is searched
-_LINE, _DETOUR = 16, 1.1  # points of a straight way to another branch; it may increase the hand's cost so much
-_SLOWING, _RETREAT = 0.1, 0.05  # s in which links that come near each other lose 63 % of the room; m/s apart, at most
-_AT_WALL = 1e-6  # m
-_BACKED = 4  # times that a step which goes too far is halved
-_LEAD, _CORNER = 1.0, 0.03  # ticks that the path leads the command, where links have less room [chain lengths]
+_AT_LIMIT = 1e-3  # rad
 
 
 class TeleoperationStatus(NamedTuple):
@@ -142,13 +129,10 @@ class Teleoperator:
             rows.hand_rows(hands) for rows, hands in zip(self._rows, self._pairs.T, strict=True)
         )
         self._samples = Samples(self._leads, self.period)
-        self._gripper = _Gripper(*grippers, self.period)
-        self._limiter = _Limiter(self.limits, self.period)
-        self._steps = int(np.clip(np.ceil(self.period / _STEP_TIME), 1, _MAX_STEPS))
-        self._smoothing = float(1 - np.exp(-self.period / _SPEED_TIME))
-        self._reach = self.limits.velocity * self.period
-        self._contacts = None if capsules is None else SelfContacts(follower, capsules)
-        self._branches = BranchSearch(self._pose, own, follower, self.limits.position, self._contacts)
+        self._gripper = Gripper(*grippers, self.period)
+        contacts = None if capsules is None else SelfContacts(follower, capsules)
+        ways = [functools.partial(self._goal_ahead, way) for way in self._leads.ways]
+        self._live = LiveFollower(self._pose, own, follower, self.limits, self.period, contacts, ways)
         self.engagements = 0
         self.reset(home)
 
@@ -163,7 +147,7 @@ class Teleoperator:
         inside = qpos.shape == (joints,) and bool(np.all((qpos >= self._lower - 1e-6) & (qpos <= self._upper + 1e-6)))
         if not inside:
             raise ValueError(f"qpos: expected {joints} angles within the follower's limits [rad], got {qpos.tolist()}")
-        self._limiter.start(np.clip(qpos, self._lower, self._upper))
+        self._live.reset(qpos)
         self.disengage()
 
     def engage(self) -> None:
@@ -171,13 +155,7 @@ class Teleoperator:
         self.is_engaged, self._anchor = True, None
         self._goal: Any = None  # or a `Goal`
         self.engagements += 1
-        self._posture = self._path = self._limiter.qpos
-        self._speed, self._posture_rows, self._is_reached = np.zeros_like(self._path), None, True
-        self._left = FAR
-        self._is_near, self._stuck, self._searched, self._is_chosen = self._is_relative, 0.0, None, False
-        self._pace, self._time_left = 1.0 if self._is_relative else _APPROACH, np.inf
-        self._cost, self._allowed = 0.0, np.inf  # of the hand on the way to another branch
-        self._held_apart = ""  # links of the follower that hold its posture back
+        self._live.engage(is_near=self._is_relative)
 
     def disengage(self) -> None:
         """Brakes the follower, which then stays where it is."""
@@ -187,7 +165,7 @@ class Teleoperator:
     @property
     def qpos(self) -> Float[np.ndarray, " joints"]:
         """The last command [rad]."""
-        return self._limiter.qpos
+        return self._live.qpos
 
     @property
     def leader_qpos(self) -> np.ndarray | None:
@@ -219,19 +197,17 @@ class Teleoperator:
         opening = self._gripper.step(gripper if self.is_engaged else None)
         if not self.is_engaged:
             status = TeleoperationStatus("disengaged", "engage() lets the leader drive", np.nan, np.nan)
-            return FollowerCommand(self._limiter.brake(), opening, status)
+            return FollowerCommand(self._live.brake(), opening, status)
         if sample is not None:
             self._goal = self._goal_of(sample)
         if self._goal is None:
             status = TeleoperationStatus("waiting", self._samples.reason or "no sample yet", np.nan, np.nan)
-            return FollowerCommand(self._limiter.step(self._path, self._speed), opening, status)
-        self._advance(self._goal)
-        qpos = self._limiter.step(self._path, self._speed)
-        rows = self._rows[1](np.array([self._posture, qpos]))
-        self._posture_rows = rows[:1]
-        if not self._is_near:
-            self._cost = float(self._pose.cost(self._goal, rows[1:])[0])
-        return FollowerCommand(qpos, opening, self._status(*self._pose.errors(self._goal, rows)))
+            return FollowerCommand(self._live.wait(), opening, status)
+        return FollowerCommand(self._live.follow(self._goal), opening, self._status())
+
+    def _goal_ahead(self, way: Way, angle: float) -> Goal:
+        """The goal that the leader would have farther on."""
+        return self._goal_of(way(self._samples.last, angle))
 
     def _goal_of(self, sample: np.ndarray) -> Goal:
         """The goal of a sample of the leader."""
@@ -245,7 +221,7 @@ class Teleoperator:
                 axes *= self._mirrored
             return self._pose.goal(rows, hands)
         if self._anchor is None:
-            self._anchor = hands.copy(), self._rows[1](self._path[None])[0].take(self._follower_hands, axis=0)
+            self._anchor = hands.copy(), self._rows[1](self._live.path[None])[0].take(self._follower_hands, axis=0)
         then, start = self._anchor
         position += start[:pairs] - then[:pairs]
         # Rows are axes: the rotation since then, R R_then^T, acts on each axis of the start.
@@ -254,247 +230,26 @@ class Teleoperator:
         axes[:] = (of_start @ (of_then.swapaxes(1, 2) @ of_now)).reshape(-1, 3)
         return self._pose.goal(rows, hands)
 
-    def _advance(self, goal: Goal) -> None:
-        """Moves the posture towards the goal, and the path towards the posture."""
-        if self._waits():
-            self._speed = 0 * self._speed
-            return
-        self._limit_approach()
-        reach, posture, rows, last = self._reach, self._posture[None], self._posture_rows, self._posture
-        if self._is_near:
-            reach = self._pace * reach
-        lower, upper = np.maximum(self._lower, last - reach), np.minimum(self._upper, last + reach)
-        self._held_apart = ""
-        for _ in range(self._steps):
-            near, walls = self._walls(posture[0], self._steps)
-            before, posture = posture, self._pose.step(goal, posture, lower, upper, NEAR, self._left, rows, walls)
-            self._hold_apart(near, walls, posture[0] - before[0])
-            if near is not None:
-                posture = self._backed(before[0], posture[0], near)[None]
-            rows = None
-        self._posture = posture[0]
-        moved = self._posture - last
-        fraction = float(np.abs(moved / reach).max())
-        # A path that goes as fast as it may ends at once, where the command must be able to stop, as one at a wall.
-        is_free = self._is_near and fraction < _FREE and not self._held_apart
-        kept = 1 - self._smoothing
-        self._speed = kept * self._speed + self._smoothing / self.period * moved if is_free else 0 * moved
-        self._search(goal)
-        if self._searched is not None and not self._is_near:
-            return  # where an approach goes is not known yet
-        if self._is_near:
-            self._path = self._posture
-        else:
-            self._approach()
-
-    def _approach(self) -> None:
-        """Moves the path towards a posture that it has not reached."""
-        moved = self._posture - self._path
-        fraction = self._ticks_away(self._posture)
-        part = moved / max(fraction, 1.0) / self._steps
-        for _ in range(self._steps):
-            near, walls = self._walls(self._path, self._steps)
-            if self._hold_apart(near, walls, part):
-                self._follow_from_here()  # by steps that know the walls
-                return
-            self._path = self._path + part
-        if fraction <= 1:
-            self._path, self._is_near = self._posture, True
-
-    def _ticks_away(self, posture: np.ndarray) -> float:
-        """Ticks that the path takes to a posture, at its pace."""
-        return float(np.abs((posture - self._path) / (self._pace * self._reach)).max())
-
-    def _limit_approach(self) -> None:
-        """Ends an approach when its time is over, or when the leader moved on so that the hand only loses by it."""
-        self._time_left -= self.period
-        is_over = self._time_left <= 0
-        if is_over or (self._is_near and self._is_reached):
-            self._pace = 1.0
-        if not self._is_near and (is_over or self._cost > self._allowed):
-            self._follow_from_here()
-
-    def _follow_from_here(self) -> None:
-        """Gives up the posture that the path has not reached."""
-        self._posture, self._posture_rows, self._is_near = self._path, None, True
-
-    def _backed(self, before: np.ndarray, after: np.ndarray, near: Near) -> np.ndarray:
-        """A step near walls, or a part of it that goes no deeper: walls may be curved."""
-        minimum = min(near.room.min(), 0.0) - _AT_WALL
-        for _ in range(_BACKED):
-            now = self._contacts and self._contacts.near(after)
-            if now is None or now.room.min() >= minimum:
-                return after
-            after = (before + after) / 2
-        return before
-
-    def _waits(self) -> bool:
-        """Whether the path waits for the command, which would cut a corner between links that are near each other."""
-        if self._contacts is None or np.all(np.abs(self._path - self._limiter.qpos) <= _LEAD * self._reach):
-            return False
-        near = [self._contacts.near(qpos) for qpos in (self._path, self._limiter.qpos)]
-        return any(x is not None and x.room.min() < _CORNER * self._rows[1].unit for x in near)
-
-    def _walls(self, qpos: np.ndarray, steps: int = 1) -> tuple[Near | None, Any]:
-        """Links near each other in a posture, and how far a step of a tick may change their distances."""
-        near = None if self._contacts is None else self._contacts.near(qpos)
-        if near is None:
-            return None, None
-        bounds = np.minimum(-self.period / _SLOWING * near.room, _RETREAT * self.period) / steps
-        return near, (near.gradient, bounds)
-
-    def _hold_apart(self, near: Near | None, walls: Any, moved: np.ndarray) -> bool:
-        """Notes whether a step is at a wall, or beyond."""
-        is_held = near is not None and bool(np.any(walls[0] @ moved <= walls[1] + _AT_WALL))
-        if self._contacts is not None and near is not None and is_held:
-            self._held_apart = self._contacts.names(near)
-        return is_held
-
-    def _search(self, goal: Goal) -> None:
-        """Searches other branches at the start of an approach, and while the hand is not reached, in each tick."""
-        if self._searched is None:
-            is_well = self._is_reached or not self._is_near
-            self._stuck = 0.0 if is_well else self._stuck + self.period
-            if self._is_near and self._stuck < _STUCK:
-                return
-            if not self._is_near and self._is_chosen:
-                return  # on its way
-            now = self._posture, lambda: self._goal
-            search, ahead = self._branches, lambda way, angle: self._goal_of(way(self._samples.last, angle))
-            ways = [functools.partial(ahead, way) for way in self._leads.ways]
-            self._searched = search.search(*now) if self._is_near else search.search_ahead(*now, ways)
-        found = None
-        for _ in range(self._steps):
-            found = found or next(self._searched)
-        if found is None:
-            return
-        self._searched, self._stuck, self._is_chosen = None, 0.0, True
-        posture = self._turned(found[0])
-        if not self._is_near or self._leads_there(goal, posture, found[1]):
-            self._posture, self._posture_rows, self._is_near = posture, None, False
-            self._time_left = _OVERTIME * self.period * self._ticks_away(posture)
-
-    def _turned(self, posture: np.ndarray) -> np.ndarray:
-        """The posture with each joint within half a turn from the path's, where its range has both."""
-        turned = posture - 2 * np.pi * np.round((posture - self._path) / (2 * np.pi))
-        return np.where((turned >= self._lower) & (turned <= self._upper), turned, posture)
-
-    def _leads_there(self, goal: Goal, posture: np.ndarray, cost: float) -> bool:
-        """Whether another branch is better, and the hand does not go away from its goal on the straight way there."""
-        line = self._posture + np.linspace(0, 1, _LINE)[:, None] * (posture - self._posture)
-        costs = self._pose.cost(goal, self._rows[1](line))
-        self._allowed = _DETOUR * float(costs[0])
-        is_better = cost < 0.5 * costs[0] and costs.max() <= self._allowed
-        return is_better and not (self._contacts and self._contacts.touch(line[1:]).any())
-
-    def _status(self, positions: Sequence[float], rotations: Sequence[float]) -> TeleoperationStatus:
-        """What the follower does, and why, from errors [m, rad] of the hands of the posture and of the command."""
-        near, turned = _TOLERANCE
-        reached = [x <= near and y <= turned for x, y in zip(positions, rotations, strict=True)]
-        self._is_reached, self._left = reached[0], positions[0] / self._rows[1].unit
-        errors, reason = (1e3 * positions[1], math.degrees(rotations[1])), self._samples.reason
+    def _status(self) -> TeleoperationStatus:
+        """What the follower does, and why."""
+        live, reason = self._live, self._samples.reason
+        errors = 1e3 * live.error.position, math.degrees(live.error.rotation)
         if self._samples.age > _TIMEOUT:
             return TeleoperationStatus("holding", reason or f"no sample for {self._samples.age:.1f} s", *errors)
-        if not self._is_near:
+        if not live.is_near:
             return TeleoperationStatus("approaching", reason or "on the way to a posture with this hand", *errors)
-        if reached[1]:
+        if live.error.is_reached:
             return TeleoperationStatus("tracking", reason, *errors)
-        if reached[0]:
+        if live.posture_error.is_reached:
             return TeleoperationStatus("catching up", reason or "the leader is faster than the limits", *errors)
-        position, rotation = positions[0], rotations[0]
-        at_limit = (self._posture - self._lower < 1e-3) | (self._upper - self._posture < 1e-3)
+        why = self._why_nearest()
+        return TeleoperationStatus("nearest", f"{reason}; {why}" if reason else why, *errors)
+
+    def _why_nearest(self) -> str:
+        """What keeps the follower's posture from the goal, in words."""
+        posture, (position, rotation) = self._live.posture, self._live.posture_error
+        at_limit = (posture - self._lower < _AT_LIMIT) | (self._upper - posture < _AT_LIMIT)
         names = ", ".join(np.array(self.follower.joint_names)[at_limit])
-        why = f"{names} at the limit" if names else "out of reach" if position > _TOLERANCE[0] else "rotation not free"
-        why = f"{self._held_apart} would touch" if self._held_apart else why
-        why = f"{why}: the nearest hand is {1e3 * position:.0f} mm and {np.degrees(rotation):.0f} deg away"
-        why = f"{reason}; {why}" if reason else why
-        return TeleoperationStatus("nearest", why, *errors)
-
-
-def follower_limits(follower: Embodiment, velocity: Any = None) -> JointLimits:
-    """The limits of an arm's model, with this velocity [rad/s] where it is given.
-
-    Raises:
-      ValueError: no finite velocity above 0.
-    """
-    speeds = np.asarray(follower.velocity_limit if velocity is None else velocity, float)
-    if speeds.shape not in ((), (follower.num_joints,)) or not np.all(np.isfinite(speeds) & (speeds > 0)):
-        raise ValueError(
-            f"velocity: expected {follower.num_joints} maximum speeds above 0 [rad/s], or one, got {speeds.tolist()}; "
-            f"inf is of a model that states none ({follower.name})"
-        )
-    speeds = np.broadcast_to(speeds, follower.num_joints)
-    return joint_limits(np.asarray(follower.joint_range, float), speeds, np.asarray(follower.torque_limit))
-
-
-class _Gripper:
-    """Maps the opening from the leader's range to the follower's, at a limited speed."""
-
-    def __init__(self, leader: Sequence[float], follower: Sequence[float], period: float):
-        for name, limits in (("leader", leader), ("follower", follower)):
-            if len(limits) != 2 or not np.isfinite(limits).all() or limits[0] == limits[1]:
-                raise ValueError(f"grippers: expected (closed, open) of the {name}, two finite numbers, got {limits}")
-        self._leader, self._follower, self._step = tuple(leader), tuple(follower), period / _GRIPPER_TIME
-        self._goal: float | None = None
-        self._fraction: float | None = None
-
-    def step(self, value: float | None) -> float | None:
-        """The follower's opening at the end of a tick; a value that is None or not finite changes no goal."""
-        closed, opened = self._leader
-        if value is not None and np.isfinite(value):
-            self._goal = float(np.clip((value - closed) / (opened - closed), 0, 1))
-        if self._goal is None:
-            return None
-        last = self._goal if self._fraction is None else self._fraction
-        self._fraction = last + float(np.clip(self._goal - last, -self._step, self._step))
-        return self._follower[0] + self._fraction * (self._follower[1] - self._follower[0])
-
-
-class _Limiter:
-    """Ruckig's online trajectories through a goal, or to rest as soon as possible."""
-
-    def __init__(self, limits: JointLimits, period: float):
-        try:
-            import ruckig
-        except ImportError as error:
-            raise ValueError(f"Teleoperator: needs the package ruckig: {install_command('deploy')}") from error
-        joints = len(limits.velocity)
-        self._ruckig, self._input = ruckig.Ruckig(joints, period), ruckig.InputParameter(joints)
-        self._output, self._interfaces = ruckig.OutputParameter(joints), ruckig.ControlInterface
-        self._input.minimum_duration = _AHEAD  # as fast as possible, a trajectory of each tick has all the acceleration
-        self._input.max_velocity, self._input.max_acceleration = limits.velocity.tolist(), limits.acceleration.tolist()
-        self._input.max_jerk = limits.jerk.tolist()
-        self._zero, self._limits = [0.0] * joints, limits
-
-    @property
-    def qpos(self) -> np.ndarray:
-        """The last command [rad]."""
-        return np.array(self._input.current_position)
-
-    def start(self, qpos: np.ndarray) -> None:
-        """At rest at these angles [rad]."""
-        self._input.current_position = self._input.target_position = qpos.tolist()
-        self._input.current_velocity = self._input.current_acceleration = self._zero
-
-    def step(self, goal: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """Angles after a tick on the way through a goal [rad] at a speed [rad/s], from which joints can still stop."""
-        lower, upper = self._limits.position.T
-        ahead = np.minimum(np.maximum(goal + _AHEAD * speed, lower), upper)
-        down, up = (np.sqrt(_BRAKING * self._limits.acceleration * x) for x in (ahead - lower, upper - ahead))
-        self._input.control_interface, self._input.target_position = self._interfaces.Position, ahead.tolist()
-        self._input.target_velocity = np.minimum(np.maximum(speed, -down), up).tolist()
-        return self._next()
-
-    def brake(self) -> np.ndarray:
-        """Angles after a tick of braking [rad]."""
-        self._input.control_interface, self._input.target_velocity = self._interfaces.Velocity, self._zero
-        return self._next()
-
-    def _next(self) -> np.ndarray:
-        result = self._ruckig.update(self._input, self._output)
-        if result < 0 and self._input.control_interface == self._interfaces.Position:
-            return self.brake()  # a goal that it cannot compute
-        if result < 0:
-            raise RuntimeError(f"ruckig: {result}")
-        self._output.pass_to_input(self._input)
-        return self.qpos
+        why = f"{names} at the limit" if names else "out of reach" if position > REACHED[0] else "rotation not free"
+        why = f"{self._live.held_apart} would touch" if self._live.held_apart else why
+        return f"{why}: the nearest hand is {1e3 * position:.0f} mm and {np.degrees(rotation):.0f} deg away"

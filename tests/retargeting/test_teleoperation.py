@@ -9,10 +9,10 @@ import pytest
 import mimic
 from mimic.control.clearance import clearance
 from mimic.metric.capsule_distances import clearance_constants
+from mimic.retargeting.follower_limits import follower_limits
 from mimic.retargeting.hand_target import matched_hands
 from mimic.retargeting.live_pose import FAR, ArmRows, LivePose
 from mimic.retargeting.self_contacts import APART, SelfContacts
-from mimic.retargeting.teleoperation import follower_limits
 from tests.helpers import original_model
 
 RATE = 100.0
@@ -263,7 +263,7 @@ def test_arguments_are_checked(arms):
 def test_flipped_wrists_keep_the_rotation_of_the_hand(arms, tmp_path):
     (file := tmp_path / "ur.xml").write_text(original_model.ur_like())
     arm = mimic.build_arm(mimic.ArmConfig(model=str(file)), "hardware").embodiment
-    search, rows = mimic.Teleoperator(arms[0], arm, velocity=3.0)._branches, ArmRows(arm)
+    search, rows = mimic.Teleoperator(arms[0], arm, velocity=3.0)._live._branches, ArmRows(arm)
     flipped = search._flipped(np.array([0.3, -1.2, 1.4, -1.0, -1.2, 0.2]))
     assert len(flipped) > 1 and np.all(np.abs(np.diff(flipped, axis=0)).max(axis=1) > 1)
     axes = rows(flipped)[:, rows.hand_rows(np.array([0]))[1:]]
