@@ -49,8 +49,8 @@ PAIRS = {
 
 def imitate(expert: Arm, learner: Arm, **options: Any) -> Solver:
     pair = expert.embodiment, learner.embodiment
-    metric = METRIC.make_correspondence(*pair), METRIC.make_weights()
-    return jax.jit(lambda qpos: mimic.imitate_pose(*pair, qpos, *metric, **options).qpos)
+    metric = METRIC.build(*pair).arguments
+    return jax.jit(lambda qpos: mimic.imitate_pose(*pair, qpos, **metric, **options).qpos)
 
 
 def with_mink(expert: Arm, learner: Arm) -> Solver:

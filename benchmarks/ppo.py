@@ -50,8 +50,9 @@ def settings(config: PPOConfig) -> dict[str, Any]:
 
 
 def mimic_loop(physics: str, name: str, config: PPOConfig, batches: int) -> dict[str, float]:
+    env = mimic.make(name, physics=physics)
     times = [time.perf_counter()]
-    start, _, epoch = compile_training(mimic.make(name, physics=physics), config, batches)
+    start, _, epoch = compile_training(env, config, batches)
     state = start(0)
     for _ in range(EPOCHS):
         state, metrics = epoch()(state)

@@ -20,6 +20,9 @@ def speeds(
     def pairs(method: str, quantity: str) -> str:
         return large(one(kernel["results"], method=method, quantity=quantity, size=10_000_000)["pairs_per_s"])
 
+    def both(quantity: str) -> str:
+        return f"{pairs('mimic', quantity)}; {pairs('mimic, with hands', quantity)}"
+
     def steps(group: str, arms: int) -> str:
         return large(one(rollout["rows"], env="panda7dof", group=group, case="fused", arms=arms)["steps_per_s"])
 
@@ -34,14 +37,14 @@ def speeds(
         for pair in ("7->4", "7->7")
     ]
     goals = {run["report"]["env"]: run["to_goal_s"] for run in mapper["runs"]}
-    ppo = one(scaling["rows"], scaling="weak", devices=1)["steps_per_s"]
+    ppo, two = (one(scaling["rows"], scaling="weak", devices=devices) for devices in (1, 2))
     tip = one(accuracy["results"][0]["candidates"], engine="fused", substeps=10)["error_mm"]["end"]
     return [
         ("what", "measured", "target"),
-        ("distance of two arms from joint motions, 7 and 7 links [pairs/s]", pairs("mimic", "value"), "10 G"),
-        ("its gradient by the learner's motion", pairs("mimic", "gradient"), "4 G"),
-        ("the same by both arms' motions", pairs("mimic", "all"), ""),
-        ("distance composed of `link_states` and `embodiment_distance`", pairs("composition", "value"), ""),
+        ("distance of two arms from joint motions, 7 and 7 links; with hands [pairs/s]", both("value"), "10 G"),
+        ("its gradient by the learner's motion", both("gradient"), "4 G"),
+        ("the same by both arms' motions", both("all"), ""),
+        ("distance of links composed of `link_states` and `embodiment_distance`", pairs("composition", "value"), ""),
         (
             "physics, Panda with 7 joints, 8192; 65,536 arms [steps/s]",
             f"{steps('physics', 8192)}; {steps('physics', 65536)}",
@@ -52,7 +55,8 @@ def speeds(
             f"{steps('environment', 8192)}; {steps('environment', 131072)}",
             "",
         ),
-        ("PPO with learning, 4 joints [environment steps/s]", large(ppo), "2 M"),
+        ("PPO with learning, 4 joints [environment steps/s]", large(ppo["steps_per_s"]), "2 M"),
+        ("the same on two GPUs, a process each", f"{large(two['steps_per_s'])} ({two['efficiency']:.0%})", "95%"),
         ("process start to a gap of 2 %, one demonstration, cold", to_goal(gpu, "cold"), "20 s"),
         ("the same with a warm compilation cache", to_goal(gpu, "warm"), "10 s"),
         ("the same, cold, on two CPU cores", to_goal(cpu, "cold"), "180 s"),
@@ -74,14 +78,6 @@ def speeds(
             "1 mm",
         ),
     ]
-
-
-def several_gpus(two: Results, four: Results) -> list[Cells]:
-    rows: list[Cells] = [("GPUs, a process each", "environment steps/s", "per GPU, of one GPU's speed")]
-    for results, devices in ((two, 2), (four, 4)):
-        row = one(results["rows"], scaling="weak", devices=devices, processes=devices)
-        rows.append((str(devices), large(row["steps_per_s"]), f"{row['efficiency']:.0%}"))
-    return rows
 
 
 PPO_CASES = {
@@ -110,7 +106,6 @@ def physics(rollout: Results) -> list[Cells]:
         "`env.physics=fused`": ("fused", "fused"),
         "`env.physics=mjx`": ("mjx", "mjx"),
         "`mjx.Data` carried from step to step, reset by brax's wrappers": ("mjx.Data carried", "stock"),
-        "MJX-Warp, `mjx.Data` carried": ("MJX-Warp", ""),
         "C MuJoCo, all cores": ("C MuJoCo, all cores", ""),
     }
     rows: list[Cells] = [("", "physics, steps/s", "environment steps/s", "device memory of an arm")]
