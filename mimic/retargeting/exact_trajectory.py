@@ -4,7 +4,8 @@ The branches of postures are searched at some times, the anchors, and tracked fr
 backwards, within the velocity limits. So each time has a set of candidates. Dynamic programming finds the path through
 them that is exact as often as it can be, and then of least distance. Where this path changes branch faster than the
 velocity limits allow, the arm follows it as fast as it may, with an exact hand if it is redundant. The postures of a
-redundant arm are then smoothed over time, with the hand where it is.
+redundant arm are then smoothed over time, with the hand where it is. Where its hand is still not exact at some times,
+although there are postures, ways past these times are searched among all postures of its self-motions.
 
 JAX computes chunks of a fixed number of times, so that motions of all lengths share its compiled functions.
 """
@@ -22,17 +23,26 @@ from jaxtyping import Array, Float
 
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.link_match import hand_poses
 from mimic.arms.pose_limits import continuous_joints, motion_limits, pose_limits
 from mimic.base.compilation import UNOPTIMIZED, by_value, compiled_once, in_background
 from mimic.metric.distance import Metric
 from mimic.retargeting.costs import NO_COSTS, Costs
 from mimic.retargeting.exact_chunks import CHUNK, by_chunks, hand_report, in_chunks
 from mimic.retargeting.exact_pose import DESCENTS, FINE, ExactTargets, exact_solver
-from mimic.retargeting.hand_target import HandError, Placement, hand_cost_derivatives, is_exact
+from mimic.retargeting.hand_target import (
+    HandError,
+    Placement,
+    hand_cost_derivatives,
+    is_exact,
+    matched_hands,
+    placed_hands,
+)
 from mimic.retargeting.initial_guesses import RandomPoses
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, newton
 from mimic.retargeting.path_smoothing import smoothed
 from mimic.retargeting.pose import PoseImitation, shared_joints, wrap_angles
+from mimic.retargeting.self_motions import past_failing_times
 
 SPACING, SEGMENTS = 16, CHUNK // 16  # times from one anchor to the next, and such segments in a chunk
 _BRANCHES = 9  # at each anchor
@@ -84,22 +94,29 @@ def exact_trajectory(
     # Whether a redundant arm stays exact on the way to another branch is only known when it goes there.
     is_redundant = learner.num_joints > 6 * len(learner.hand_joint)
 
-    def realized(path: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Angles, distances and errors of the hand on a path, as fast as it can be followed."""
-        qpos = within_ranges(path, ranges)
-        if np.any(np.abs(np.diff(qpos, axis=0)) > jump):
-            qpos = _followed(arms, poses, qpos, base, jump)
-        if is_redundant:
-            qpos = smoothed(arms, poses, qpos, base, jump)
+    def judged(qpos: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Angles, smoothed where the arm is redundant, with distances and errors of the hand."""
+        qpos = smoothed(arms, poses, qpos, base, jump) if is_redundant else qpos
         return qpos, *by_chunks(lambda x, qpos: report(x, base, qpos), poses, qpos)
 
-    costs_of_step = (_PER_STEP, _INEXACT) if is_redundant else (_INEXACT,)
+    def order(path: tuple[np.ndarray, ...]) -> tuple[float, float]:
+        return is_exact(*path[2:]).sum(), -path[1].mean()
+
     paths: list[tuple[np.ndarray, ...]] = []
-    for cost_of_step in costs_of_step:
-        paths.append(realized(best_path(candidates, jump, continuous, cost_of_step)))
+    for cost_of_step in (_PER_STEP, _INEXACT) if is_redundant else (_INEXACT,):
+        qpos = within_ranges(best_path(candidates, jump, continuous, cost_of_step), ranges)
+        if np.any(np.abs(np.diff(qpos, axis=0)) > jump):  # followed as fast as it can be
+            qpos = _followed(arms, poses, qpos, base, jump)
+        paths.append(judged(qpos))
         if is_exact(*paths[-1][2:]).all():  # and, with the lower cost, of the lower distance
             break
-    qpos, distance, position, rotation = max(paths, key=lambda path: (is_exact(*path[2:]).sum(), -path[1].mean()))
+    best = max(paths, key=order)
+    if is_redundant and not (exact := is_exact(*best[2:])).all():
+        chosen, possible = matched_hands(expert, learner), candidates.cost.min(axis=1) < _INEXACT
+        hands = placed_hands(base, hand_poses(expert, poses)[:, chosen[:, 0]])
+        other = past_failing_times(learner, chosen[:, 1], hands, best[0], exact, jump, possible)
+        best = max(best, judged(other), key=order)
+    qpos, distance, position, rotation = best
     lower, upper = motion_limits(learner)
     inside = (qpos >= lower - 1e-6) & (qpos <= upper + 1e-6)
     qpos, distance, position, rotation = map(jnp.asarray, (qpos, distance, position, rotation))

@@ -4,10 +4,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.metric.kinematics import link_state_table
+from mimic.arms.link_match import hands_of_bodies
+from mimic.control.clearance import body_poses
 from mimic.retargeting.hand_target import Placement, matched_hands
-
-_STEP = 1e-5  # rad, of the differences that give a hand's velocity
 
 
 def speeds_needed(
@@ -40,12 +39,23 @@ def speeds_needed(
 
 
 def hand_jacobians(arm: Embodiment, qpos: np.ndarray) -> Float[np.ndarray, "poses hands 6 joints"]:
-    """Linear [m] and angular velocity [rad] of the hands for each joint's velocity."""
-    unit = np.eye(arm.num_joints)
-    steps = np.asarray(qpos, float)[:, None, None] + _STEP * np.stack([-unit, unit], axis=1)
-    moved = link_state_table(arm, steps, np.zeros_like(steps), float).hand
-    here, speeds = np.broadcast_arrays(qpos[:, None].astype(float), unit)
-    turned = link_state_table(arm, here, speeds, float).hand
-    assert moved is not None and turned is not None
-    linear = np.diff(moved.position, axis=2)[:, :, 0] * float(arm.chain_length) / (2 * _STEP)
-    return np.moveaxis(np.concatenate([linear, turned.angular_velocity], axis=-1), 1, -1)
+    """Linear [m] and angular velocity [rad] of the hands for each joint's velocity, in the base frame."""
+    return hands_and_jacobians(arm, qpos)[1]
+
+
+def hands_and_jacobians(
+    arm: Embodiment, qpos: Float[np.ndarray, "poses joints"]
+) -> tuple[Float[np.ndarray, "poses hands 4 4"], Float[np.ndarray, "poses hands 6 joints"]]:
+    """Poses of the hands, as of `hand_poses`, and what `hand_jacobians` returns, in double precision."""
+    joint_axis, anchor = np.asarray(arm.joint_axis, float), np.asarray(arm.joint_anchor, float)
+    rotations, shifts = body_poses(np.asarray(qpos, float), arm.joint_parent, joint_axis, anchor)
+    poses = hands_of_bodies(arm, rotations, shifts)
+    axes = (rotations[:, 1:] @ joint_axis[..., None])[..., 0]
+    anchors = (rotations[:, 1:] @ anchor[..., None])[..., 0] + shifts[:, 1:]
+    linear = np.cross(axes[:, None], poses[:, :, None, :3, 3] - anchors[:, None])
+    turns = np.concatenate([linear, np.broadcast_to(axes[:, None], linear.shape)], axis=-1)
+    moves = np.zeros((len(arm.hand_joint), arm.num_joints, 1))  # whether a joint moves a hand
+    for hand, joint in enumerate(arm.hand_joint):
+        while joint >= 0:
+            moves[hand, joint], joint = 1.0, arm.joint_parent[joint]
+    return poses, np.swapaxes(moves * turns, -1, -2)

@@ -120,6 +120,14 @@ def in_base(base: Placement, target: HandTarget) -> HandTarget:
     return HandTarget(rotated(rows, target.position - shift, 1), rotated(rows, target.axes, 2))
 
 
+def placed_hands(base: Placement, hands: Float[np.ndarray, "time hands 4 4"]) -> Float[np.ndarray, "time hands 4 4"]:
+    """Hands in the expert's base frame, in that of the learner, by NumPy; the base is one for all times."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = np.transpose(base.rotation)
+    inverse[:3, 3] = -inverse[:3, :3] @ base.position
+    return inverse @ hands
+
+
 def rotated(rows: Rotation, vectors: Array, axis: int) -> Array:
     """Vectors along an axis of an array, rotated; elementwise, so that nothing is rounded to TF32."""
     components = [jnp.take(vectors, i, axis) for i in range(3)]

@@ -1,0 +1,44 @@
+"""Tests of mimic/retargeting/self_motions.py."""
+
+import numpy as np
+import pytest
+
+from mimic.arms.embodiment import panda
+from mimic.arms.link_match import hand_poses
+from mimic.retargeting.self_motions import past_failing_times
+
+TIMES, FAILING = 60, slice(30, 45)
+HAND = np.zeros(1, int)
+JUMP = np.full(7, 0.05)  # rad from one time to the next
+
+
+@pytest.fixture(scope="module")
+def motion():
+    """A motion of the Panda [time, joints] within `JUMP`, without a posture near a limit."""
+    start = np.array([0.1, -0.4, 0.2, -1.8, 0.1, 1.6, 0.5])
+    time = np.linspace(0, 1, TIMES)[:, None]
+    return start + np.array([0.9, 0.5, -0.8, 0.4, 0.7, 0.5, -0.9]) * np.sin(3 * time)
+
+
+def errors(path, targets):
+    """Largest difference of the entries of the hands' poses at each time."""
+    return np.abs(hand_poses(panda(), path) - targets).max(axis=(1, 2, 3))
+
+
+def test_a_redundant_arm_gets_past_times_without_an_exact_hand(motion):
+    targets, path, exact = hand_poses(panda(), motion), motion.copy(), np.ones(TIMES, bool)
+    path[FAILING], exact[FAILING] = motion[FAILING.start - 1], False
+    assert errors(path, targets)[~exact].min() > 1e-3
+    found = past_failing_times(panda(), HAND, targets, path, exact, JUMP)
+    assert errors(found, targets).max() < 1e-4  # entries of exact hands: 0.1 mm, and 0.01 deg is 1.7e-4 rad
+    assert (np.abs(np.diff(found, axis=0)) <= JUMP).all()
+    np.testing.assert_array_equal(found[-1], path[-1])  # back on the path
+
+
+@pytest.mark.parametrize("possible", [None, np.arange(TIMES) != FAILING.start])
+def test_a_path_that_no_way_leads_past_stays(motion, possible):
+    targets, path, exact = hand_poses(panda(), motion), motion.copy(), np.ones(TIMES, bool)
+    exact[FAILING] = False
+    if possible is None:
+        targets[FAILING.start, :, 2, 3] += 2.0  # m, out of reach
+    np.testing.assert_array_equal(past_failing_times(panda(), HAND, targets, path, exact, JUMP, possible), path)
