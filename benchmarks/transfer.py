@@ -50,6 +50,8 @@ from benchmarks.exact_hands import SPEEDS, all_postures, as_numbers, followed_by
 from benchmarks.teleoperation import BASE, SPEED, arm, hand_errors, recordings
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.compile_check import VELOCITY_LIMIT
+from mimic.arms.embodiment import Embodiment
+from mimic.arms.link_match import hand_poses
 from mimic.base.files import write_atomically
 from mimic.commands.config import RetargetConfig
 from mimic.commands.retarget import prepare_retargeting
@@ -138,6 +140,12 @@ def targets(expert: Model, qpos: np.ndarray, base: list[float]) -> np.ndarray:
     return np.linalg.inv(homogeneous(*placement(base))) @ np.stack([expert.hand(pose) for pose in qpos])
 
 
+def of_arm(arm: Embodiment, model: Model, hands: np.ndarray) -> np.ndarray:
+    """Poses [time, 4, 4] of the site as those of the arm's hand, whose axes may be others."""
+    qpos = np.asarray(arm.home, float)
+    return hands @ np.linalg.inv(model.hand(qpos)) @ hand_poses(arm, qpos)[0]
+
+
 def check(learner: Model, qpos: np.ndarray, hands: np.ndarray, dt: float, speeds: list[float]) -> Row:
     """What C MuJoCo says of a motion."""
     own = np.stack([learner.hand(pose) for pose in qpos])
@@ -173,14 +181,15 @@ def pair_row(options: argparse.Namespace, expert: Model, name: str, learner: Mod
     return as_numbers({**row, "seconds": report["seconds"], "base": report["base"], "failures": causes})
 
 
-def failing_rows(options: argparse.Namespace, expert: Model, row: Row) -> Iterator[Row]:
+def failing_rows(options: argparse.Namespace, expert: Model, learner: Model, row: Row) -> Iterator[Row]:
     """What each run of frames that fail needs at its hardest frame."""
     out, name = Path(options.work) / f"{row['task']}_{row['learner']}", row["learner"]
     (episode,) = json.loads((out / "report.json").read_text())["episodes"]
     with h5py.File(Path(options.demonstrations) / row["task"] / "demo.hdf5") as file:
         states = np.asarray(file[f"{_EPISODE}/states"], float)
-    hands, dt = targets(expert, states[:, 1:8], row["base"]), float(np.median(np.diff(states[:, 0])))
     arm = build_arm(ArmConfig(model=str(with_speeds(options.folder, name))), "hardware").embodiment
+    hands = of_arm(arm, learner, targets(expert, states[:, 1:8], row["base"]))
+    dt = float(np.median(np.diff(states[:, 0])))
     postures_of, limits = all_postures(arm), np.array(SPEEDS[name])
     runs: list[list[int]] = []
     for failure in episode["failures"]:
@@ -285,7 +294,9 @@ def in_physics(options: argparse.Namespace, expert: Model, method: str, row: Row
     if method == "mimic":
         qpos = np.load(work / f"{task}_{name}.npy")
     elif method == "ssik":
-        qpos = followed_by_ssik(arm, targets(expert, qpos, row["base"]), np.asarray(arm.home, float))
+        learner = Model(Path(options.folder) / name / f"{name}.xml")
+        hands = of_arm(arm, learner, targets(expert, qpos, row["base"]))
+        qpos = followed_by_ssik(arm, hands, np.asarray(arm.home, float))
     elif method == "copied":
         qpos = np.clip(qpos[:, : arm.num_joints], *arm.joint_range.T)
     np.save(path, qpos)
@@ -329,7 +340,7 @@ def main(arguments: list[str] | None = None) -> None:
         for task in options.tasks:
             measure = functools.partial(pair_row, options, expert, name, learner, task)
             content["pairs"].append(kept(options, Path(options.work) / f"{task}_{name}.json", measure))
-            content["failing"] += failing_rows(options, expert, content["pairs"][-1])
+            content["failing"] += failing_rows(options, expert, learner, content["pairs"][-1])
             write_results(options, **content)
             print_table(content["pairs"][-1:], PAIRS)
         if "lift" in options.tasks and len(learner.range) == _WITHOUT_REDUNDANCY:

@@ -91,12 +91,11 @@ def _way(
     reached, parents = [path[begin][None]], []
     for time in range(begin, len(path) - 1):
         if time >= first and exact[time + 1]:
-            for node, qpos in enumerate(reached[-1]):
-                turns = 2 * np.pi * np.round((qpos - path[time + 1]) / (2 * np.pi)) * arm.continuous
-                rest = path[time + 1 :] + turns
-                if _within(arm, rest).all() and np.all(np.abs(rest[0] - qpos) <= arm.jump):
-                    way = _traced(reached, parents, node)
-                    return np.concatenate([path[:begin], way, rest]), time + 1
+            apart = wrap_angles(reached[-1] - path[time + 1], arm.continuous)
+            for node in np.flatnonzero(np.all(np.abs(apart) <= arm.jump, axis=1)):
+                rest = path[time + 1 :] + (reached[-1][node] - path[time + 1] - apart[node])  # full revolutions
+                if _within(arm, rest).all():
+                    return np.concatenate([path[:begin], _traced(reached, parents, int(node)), rest]), time + 1
         qpos, origin = _next(arm, targets[time + 1], reached[-1])
         if not len(qpos):
             return None
@@ -148,7 +147,7 @@ def _at_hand(arm: _Arm, target: np.ndarray, qpos: np.ndarray) -> tuple[np.ndarra
         change = np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(square, error[..., None])
         qpos = qpos - arm.jump * change[..., 0]
         jacobian, error = _jacobian_and_error(arm, target, qpos)
-    apart = np.linalg.norm(error.reshape(len(qpos), -1, 2, 3), axis=-1).max(axis=1)
+    apart = np.linalg.norm(error.reshape(len(qpos), len(arm.chosen), 2, 3), axis=-1).max(axis=1)
     exact = np.all(apart <= _CLOSE * np.array([POSITION_TOLERANCE, ROTATION_TOLERANCE]), axis=1)
     return qpos, jacobian, exact & _within(arm, qpos)
 
@@ -161,8 +160,9 @@ def _jacobian_and_error(arm: _Arm, target: np.ndarray, qpos: np.ndarray) -> tupl
     skew = (apart - np.swapaxes(apart, -1, -2)) / 2
     rotation = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
     error = np.concatenate([poses[..., :3, 3] - target[:, :3, 3], rotation], axis=-1)
-    jacobian = jacobian[:, arm.chosen].reshape(len(qpos), -1, len(arm.jump)) * arm.jump
-    return jacobian, error.reshape(len(qpos), -1)
+    rows = 6 * len(arm.chosen)
+    jacobian = jacobian[:, arm.chosen].reshape(len(qpos), rows, len(arm.jump)) * arm.jump
+    return jacobian, error.reshape(len(qpos), rows)
 
 
 def _within(arm: _Arm, qpos: np.ndarray) -> Bool[np.ndarray, " postures"]:
