@@ -20,6 +20,7 @@ from mimic.retargeting.self_contacts import Near, SelfContacts
 
 REACHED = 1e-3, np.radians(0.5)  # m, rad: hands that are nearer count as reached
 _STEP_TIME, _MAX_STEPS = 0.015, 5  # s of a tick for each step of the posture, and steps at most
+_FASTEST = 1 - 1e-6  # of the velocity limits
 _FREE, _SPEED_TIME = 0.8, 0.03  # of the velocity limits: below, the path's speed counts, smoothed over this time [s]
 _APPROACH = 0.5  # of the velocity limits, until the first goal after `engage` is reached: nobody knows the way there
 _OVERTIME = 1.25  # of the time that a posture is away
@@ -59,6 +60,7 @@ class LiveFollower:
       posture: [joints] angles that move to the goal [rad].
       path: [joints] the same, or on the way there.
       is_near: whether they are the same.
+      is_fastest: whether the posture moves as fast as the limits let it.
       posture_error, error: of the posture's hands and of the command's, in the last tick.
       held_apart: links that hold the posture back; empty without.
     """
@@ -98,7 +100,7 @@ class LiveFollower:
         self.is_near, self._stuck, self._searched, self._is_chosen = is_near, 0.0, None, False
         self._pace, self._time_left = 1.0 if is_near else _APPROACH, np.inf
         self._cost, self._allowed = 0.0, np.inf  # of the hand on the way to another branch
-        self.held_apart = ""
+        self.held_apart, self.is_fastest = "", False
 
     def brake(self) -> Float[np.ndarray, " joints"]:
         """The command of a tick in which the follower comes to rest [rad]."""
@@ -142,6 +144,7 @@ class LiveFollower:
         self.posture = posture[0]
         moved = self.posture - last
         fraction = float(np.abs(moved / reach).max())
+        self.is_fastest = fraction > _FASTEST
         # A path that goes as fast as it may ends at once, where the command must be able to stop, as one at a wall.
         is_free = self.is_near and fraction < _FREE and not self.held_apart
         kept = 1 - self._smoothing
@@ -220,7 +223,7 @@ class LiveFollower:
     def _search(self, goal: Goal) -> None:
         """Searches other branches at the start of an approach, and while the hand is not reached, in each tick."""
         if self._searched is None:
-            is_well = self.posture_error.is_reached or not self.is_near
+            is_well = self.posture_error.is_reached or self.is_fastest or not self.is_near
             self._stuck = 0.0 if is_well else self._stuck + self._period
             if self.is_near and self._stuck < _STUCK:
                 return

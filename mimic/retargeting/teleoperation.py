@@ -240,7 +240,7 @@ class Teleoperator:
             return TeleoperationStatus("approaching", reason or "on the way to a posture with this hand", *errors)
         if live.error.is_reached:
             return TeleoperationStatus("tracking", reason, *errors)
-        if live.posture_error.is_reached:
+        if live.posture_error.is_reached or live.is_fastest:
             return TeleoperationStatus("catching up", reason or "the leader is faster than the limits", *errors)
         why = self._why_nearest()
         return TeleoperationStatus("nearest", f"{reason}; {why}" if reason else why, *errors)

@@ -218,6 +218,16 @@ def test_an_approach_ends_while_the_leader_moves_faster(arms):
     assert max(command.status.position_mm for command in commands[900:]) < 120
 
 
+def test_a_leader_that_is_too_fast_is_not_said_to_be_out_of_reach(arms):
+    operator = mimic.Teleoperator(arms[0], arms[0], hand="relative", rate=RATE, velocity=0.2)
+    operator.reset(READY)
+    operator.engage()
+    commands, _ = drive(operator, sway(150))
+    states = [command.status.state for command in commands]
+    assert set(states[10:100]) == {"catching up"} and commands[90].status.position_mm > 20
+    assert "faster than the limits" in commands[90].status.reason
+
+
 def test_the_first_approach_is_slow(arms):
     operator = mimic.Teleoperator(*arms, rate=RATE)
     operator.engage()
@@ -226,10 +236,10 @@ def test_the_first_approach_is_slow(arms):
 
 
 def test_a_sample_that_jumps_is_told_where_the_hand_is_out_of_reach(arms):
-    operator = mimic.Teleoperator(*arms, hand="relative", rate=RATE)
+    operator = mimic.Teleoperator(*arms, hand="relative", scale=3.0, rate=RATE)
     operator.reset(operator.qpos)
     operator.engage()
-    for x in np.linspace(0, 1, 100):
+    for x in [*np.linspace(0, 1, 100), *np.ones(100)]:
         operator.step(READY + x * np.array([0.0, 1.5, 0.0, 2.5, 0.0, 0.0, 0.0]))
     status = operator.step(READY - 1.5).status
     assert status.state == "nearest" and "jumped" in status.reason and "nearest hand is" in status.reason
