@@ -28,7 +28,7 @@ from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.exact_hands import SPEEDS, as_numbers, hand_matrices, homogeneous, joint_motions
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.arms.embodiment import Embodiment, load_mjcf
+from mimic.arms.embodiment import Embodiment
 from mimic.control.clearance import clearance
 from mimic.metric.capsule_distances import clearance_constants
 from mimic.metric.config import MetricConfig
@@ -77,19 +77,17 @@ def clearance_of(operator: mimic.Teleoperator, capsules: mimic.Capsules) -> Call
     return lambda path: 1e3 * float(clearance(path, constants).min())
 
 
-def person(clip: Path) -> tuple[Embodiment, np.ndarray]:
-    """The right arm of a captured person, and its poses at 100 Hz."""
+def person(clip: Path, folder: str) -> tuple[ArmConfig, np.ndarray]:
+    """The right arm of a captured person, whose model is written to a folder, and its poses at 100 Hz."""
     from mimic.commands.capture import read_arm
     from mimic.commands.config import CaptureConfig
     from mimic.motions.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
 
     part = max(read_arm(clip, "right", CaptureConfig()).parts, key=lambda part: len(part.start))
     zero = zero_frames(part)
-    with tempfile.TemporaryDirectory() as folder:
-        (path := Path(folder) / "person.xml").write_text(ball_chain_xml(part, zero))
-        leader = load_mjcf(str(path))
+    (path := Path(folder) / "person.xml").write_text(ball_chain_xml(part, zero))
     qpos = np.unwrap(ball_chain_motion(part, zero)[0], axis=0)
-    return leader, resampled(qpos, part.rate)
+    return ArmConfig(model=str(path)), resampled(qpos, part.rate)
 
 
 def resampled(qpos: np.ndarray, rate: float) -> np.ndarray:
@@ -234,7 +232,9 @@ def sweep(name: str, options: argparse.Namespace, block: int = 20000) -> Row:
     """A leader with faults, and what its follower did."""
     one, other = name.split("-")
     follower, rng = arm(other, options), np.random.default_rng(PAIRS.index(name))
-    leader, clip = person(options.clip) if one == "person" else (arm(one, options), None)
+    with tempfile.TemporaryDirectory() as folder:
+        model, clip = person(options.clip, folder) if one == "person" else (config(one, options), None)
+        leader = build_arm(model, "hardware").embodiment
     scale = float(follower.chain_length / leader.chain_length)
     capsules = None if other == "so101" else mimic.fit_capsules(config(other, options), "hardware")  # it has no shapes
     operator = mimic.Teleoperator(leader, follower, scale=scale, velocity=SPEED[other], rate=_RATE, capsules=capsules)
