@@ -68,7 +68,7 @@ def prepare_data_set(config: RetargetConfig) -> Callable[[], int]:
     free = build_arm(dataclasses.replace(env.expert, home=None), config.limits or "none").embodiment
     for arm in (expert, learner):
         if not len(arm.hand_joint):
-            raise ValueError(f"expected arms whose hand is known, got {arm.name}; env.ROLE.hand= names a frame as the hand")
+            raise ValueError(f"expected arms whose hand is known, got {arm.name}; env.ROLE.hand= names its frame")
     data = read_data_set(
         Path(config.source).expanduser(), free, joints=config.joints, topic=config.topic, units=config.units,
         rate=config.rate, joint_range=expert.joint_range,
