@@ -69,6 +69,20 @@ class Candidates(NamedTuple):
     cost: Float[Any, "time candidates"]
 
 
+class _Path(NamedTuple):
+    """Angles [rad], distances and errors of the hand [m, rad] of a path, and when it is exact within the limits."""
+
+    qpos: np.ndarray
+    distance: np.ndarray
+    position: np.ndarray
+    rotation: np.ndarray
+    exact: np.ndarray
+
+    def order(self) -> tuple[int, float]:
+        """Greater for a better path."""
+        return int(self.exact.sum()), -float(self.distance.mean())
+
+
 def exact_trajectory(
     expert: Embodiment,
     learner: Embodiment,
@@ -93,34 +107,33 @@ def exact_trajectory(
 
     # Whether a redundant arm stays exact on the way to another branch is only known when it goes there.
     is_redundant = learner.num_joints > 6 * len(learner.hand_joint)
+    lower, upper = motion_limits(learner)
 
-    def judged(qpos: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Angles, smoothed where the arm is redundant, with distances and errors of the hand."""
+    def judged(qpos: np.ndarray) -> _Path:
+        """The path, smoothed where the arm is redundant."""
         qpos = smoothed(arms, poses, qpos, base, jump) if is_redundant else qpos
-        return qpos, *by_chunks(lambda x, qpos: report(x, base, qpos), poses, qpos)
+        distance, position, rotation = by_chunks(lambda x, qpos: report(x, base, qpos), poses, qpos)
+        inside = np.all((qpos >= lower - 1e-6) & (qpos <= upper + 1e-6), axis=-1)
+        return _Path(qpos, distance, position, rotation, is_exact(position, rotation) & inside)
 
-    def order(path: tuple[np.ndarray, ...]) -> tuple[float, float]:
-        return is_exact(*path[2:]).sum(), -path[1].mean()
-
-    paths: list[tuple[np.ndarray, ...]] = []
+    paths: list[_Path] = []
     for cost_of_step in (_PER_STEP, _INEXACT) if is_redundant else (_INEXACT,):
         qpos = within_ranges(best_path(candidates, jump, continuous, cost_of_step), ranges)
         if np.any(np.abs(np.diff(qpos, axis=0)) > jump):  # followed as fast as it can be
             qpos = _followed(arms, poses, qpos, base, jump)
         paths.append(judged(qpos))
-        if is_exact(*paths[-1][2:]).all():  # and, with the lower cost, of the lower distance
+        if paths[-1].exact.all():  # and, with the lower cost, of the lower distance
             break
-    best = max(paths, key=order)
-    if is_redundant and not (exact := is_exact(*best[2:])).all():
-        chosen, possible = matched_hands(expert, learner), candidates.cost.min(axis=1) < _INEXACT
+    best = max(paths, key=_Path.order)
+    if is_redundant and not best.exact.all():
+        chosen, possible = matched_hands(expert, learner), candidates.cost < _INEXACT
         hands = placed_hands(base, hand_poses(expert, poses)[:, chosen[:, 0]])
-        other = past_failing_times(learner, chosen[:, 1], hands, best[0], exact, jump, possible)
-        best = max(best, judged(other), key=order)
-    qpos, distance, position, rotation = best
-    lower, upper = motion_limits(learner)
-    inside = (qpos >= lower - 1e-6) & (qpos <= upper + 1e-6)
-    qpos, distance, position, rotation = map(jnp.asarray, (qpos, distance, position, rotation))
-    exact = is_exact(position, rotation) & inside.all(axis=-1)
+        starts = candidates.qpos[0][possible[0]]
+        other = past_failing_times(
+            learner, chosen[:, 1], hands, best.qpos, best.exact, jump, possible.any(axis=1), starts
+        )
+        best = max(best, judged(other), key=_Path.order)
+    qpos, distance, position, rotation, exact = map(jnp.asarray, best)
     return PoseImitation(qpos, distance, exact, HandError(position, rotation, exact))
 
 

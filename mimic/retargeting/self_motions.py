@@ -45,6 +45,12 @@ class _Arm(NamedTuple):
     upper: np.ndarray
     continuous: np.ndarray
 
+    @property
+    def middle(self) -> np.ndarray:
+        """Of the limits [rad], 0 without."""
+        lower, upper = (np.where(np.isfinite(limit), limit, 0.0) for limit in (self.lower, self.upper))
+        return (lower + upper) / 2
+
 
 def past_failing_times(
     learner: Embodiment,
@@ -54,6 +60,7 @@ def past_failing_times(
     exact: Bool[np.ndarray, " time"],
     jump: Float[np.ndarray, " joints"],
     possible: Bool[np.ndarray, " time"] | None = None,
+    starts: Float[np.ndarray, "postures joints"] | None = None,
 ) -> Float[np.ndarray, "time joints"]:
     """The path with a way past each run of times without an exact hand, where one is found.
 
@@ -62,19 +69,23 @@ def past_failing_times(
       chosen: the hands that have a target.
       targets: their poses in the learner's base frame.
       path: joint angles [rad].
-      exact: at which times of the path the hands are exact.
+      exact: at which times of the path the hands are exact, within the limits.
       jump: maximum change of each joint from one time to the next [rad].
       possible: at which times a posture with exact hands is known; there is no search past others. Default None: all.
+      starts: postures with which a way may begin at the first time; that of the path alone by default.
     """
     arm = _Arm(learner, chosen, jump * _MARGIN, *motion_limits(learner), continuous_joints(learner))
     path, exact, start = np.array(path, float), np.array(exact), 0
+    starts = np.concatenate([path[:1], np.empty((0, len(jump))) if starts is None else starts])
+    starts = starts[_within(arm, starts)]
     possible = np.ones(len(path), bool) if possible is None else possible
     while len(failing := start + np.flatnonzero(~exact[start:])):
         first = int(failing[0])
         start = first + int(np.argmax(np.append(exact[first:], True)))
         begins = dict.fromkeys(max(first - ahead, 0) for ahead in _AHEAD) if possible[first:start].all() else ()
         for begin in begins:
-            if exact[begin] and (way := _way(arm, targets, path, exact, begin, first)) is not None:
+            reached = starts if begin == 0 else path[begin : begin + 1][exact[begin : begin + 1]]
+            if len(reached) and (way := _way(arm, targets, path, exact, begin, first, reached)) is not None:
                 path, start = way
                 exact[begin:start] = True
                 break
@@ -82,13 +93,13 @@ def past_failing_times(
 
 
 def _way(
-    arm: _Arm, targets: np.ndarray, path: np.ndarray, exact: np.ndarray, begin: int, first: int
+    arm: _Arm, targets: np.ndarray, path: np.ndarray, exact: np.ndarray, begin: int, first: int, starts: np.ndarray
 ) -> tuple[np.ndarray, int] | None:
-    """The path with another way from a time on past its first failing one, and when it is on the path again.
+    """The path with another way from some postures on past its first failing time, and when it is on the path again.
 
     None where the arm cannot get past that time.
     """
-    reached, parents = [path[begin][None]], []
+    reached, parents = [starts], []
     for time in range(begin, len(path) - 1):
         if time >= first and exact[time + 1]:
             apart = wrap_angles(reached[-1] - path[time + 1], arm.continuous)
@@ -129,6 +140,10 @@ def _next(arm: _Arm, target: np.ndarray, qpos: np.ndarray) -> tuple[np.ndarray, 
     postures, origin = np.concatenate([near, spread]), np.tile(origin, len(ways) + 1)
     good = np.concatenate([good[usable], inside]) & np.all(np.abs(postures - qpos[origin]) <= arm.jump, axis=1)
     postures, origin = postures[good], origin[good]
+    order = np.argsort(
+        np.abs(postures[:, arm.continuous] - arm.middle[arm.continuous]).sum(axis=1)
+    )  # least wound first
+    postures, origin = postures[order], origin[order]
     cells = np.round(wrap_angles(postures, arm.continuous) / (_APART * arm.jump)).astype(int)
     first = np.unique(cells, axis=0, return_index=True)[1]
     first = first[:: -(-len(first) // _MOST) or 1]

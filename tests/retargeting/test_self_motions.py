@@ -42,3 +42,11 @@ def test_a_path_that_no_way_leads_past_stays(motion, possible):
     if possible is None:
         targets[FAILING.start, :, 2, 3] += 2.0  # m, out of reach
     np.testing.assert_array_equal(past_failing_times(panda(), HAND, targets, path, exact, JUMP, possible), path)
+
+
+def test_a_way_may_begin_with_other_postures_at_the_first_time(motion):
+    targets, path, exact = hand_poses(panda(), motion), motion.copy(), np.ones(TIMES, bool)
+    path[:5], exact[:5] = 0.0, False
+    np.testing.assert_array_equal(past_failing_times(panda(), HAND, targets, path, exact, JUMP)[:5], path[:5])
+    found = past_failing_times(panda(), HAND, targets, path, exact, JUMP, starts=motion[:1])
+    assert errors(found, targets).max() < 1e-4
