@@ -5,6 +5,7 @@ that it corresponds to, weighted by their fractions; these are neighbours, so th
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -56,11 +57,22 @@ class LinkMatch:
         return _by_name(self.learner, self.fractions.T @ colours_along_arm(self.expert.num_links))
 
     def ghost(
-        self, expert_qpos: Float[np.ndarray, " joints"], learner_qpos: Float[np.ndarray, " learner_joints"]
+        self,
+        expert_qpos: Float[np.ndarray, " joints"],
+        learner_qpos: Float[np.ndarray, " learner_joints"],
+        base: Sequence[float] | None = None,
     ) -> list[Capsule]:
-        """The expert's links, scaled to the learner's length and translucent, and lines to the learner's links."""
-        length = float(self.learner.chain_length)
-        links = link_ends(self.expert, expert_qpos) * length / float(self.expert.chain_length)
+        """The expert's links, translucent, and lines to the learner's links.
+
+        They are scaled to the learner's length, or with its base in the expert's base frame, [x, y, z, yaw] [m, rad],
+        they are where the expert's are.
+        """
+        length, links = float(self.learner.chain_length), link_ends(self.expert, expert_qpos)
+        if base is None:
+            links = links * length / float(self.expert.chain_length)
+        else:
+            cosine, sine = np.cos(base[3]), np.sin(base[3])
+            links = (links - base[:3]) @ np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
         colours = colours_along_arm(self.expert.num_links)
         joined = [
             Capsule(start, end, _GHOST_RADIUS * length, (*colour, _GHOST_ALPHA))

@@ -1,7 +1,7 @@
 """Content of a video as arrays: a policy's rollout, or retargeted motions."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +14,7 @@ from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.arms.link_match import LinkMatch
 from mimic.base.config import check_unused
 from mimic.commands.config import RenderConfig
+from mimic.commands.retargeted_motions import read_motions
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index, interpolate
@@ -52,6 +53,7 @@ class Clip:
       bar_names: names of these links.
       similarity: measures of `mimic.metric.similarity` of the poses, each of shape [frames].
       match: which links correspond.
+      base: of the learner in the expert's base frame, see `LinkMatch.ghost`.
     """
 
     title: str
@@ -64,6 +66,7 @@ class Clip:
     bar_names: tuple[str, ...]
     similarity: Mapping[str, Float[np.ndarray, " frames"]]
     match: LinkMatch
+    base: Sequence[float] | None = None
 
 
 class ClipPlan(NamedTuple):
@@ -87,6 +90,8 @@ def prepare_clip(config: RenderConfig) -> ClipPlan:
       ValueError: the run directory, the checkpoint or the demonstration does not exist, files belong to other arms, or
         the keys exclude each other.
     """
+    if config.retargeted and Path(config.retargeted).expanduser().is_dir():
+        return _data_set_clip(config)
     if config.retargeted or (config.demonstrations and not config.run):
         return _retargeted_clip(config)
     return _policy_clip(config)
@@ -146,6 +151,34 @@ def _retargeted_clip(config: RenderConfig) -> ClipPlan:
         _, learner_qpos = _resampled(motions, config.demonstration)
         title = f"{env.name}, demonstration {config.demonstration}"
         return _static_clip(env, title, time, qpos, learner_qpos)
+
+    return ClipPlan(env, None, compute)
+
+
+def _data_set_clip(config: RenderConfig) -> ClipPlan:
+    """An episode of a data set that `mimic.retarget` wrote, beside that of its source."""
+    check_unused(config, ("run", "checkpoint", "split", "locked", "demonstrations"), "with retargeted=FOLDER")
+    arms = {key: getattr(config, key) for key in ("expert", "learner")}
+    for key, arm in arms.items():
+        if not arm:
+            raise ValueError(f"{key}: expected with retargeted=FOLDER, as mimic.retarget had it")
+    env, motions = env_config("pair", limits=config.limits, **arms), read_motions(Path(config.retargeted).expanduser())
+    for key, arm in zip(arms, env.build_arms().embodiments, strict=True):
+        if arm.joint_names != motions.joints[key]:
+            joints, found = map(", ".join, (arm.joint_names, motions.joints[key]))
+            raise ValueError(
+                f"{key}: expected the arm of the data set, with joints {found}, got {arm.name} with {joints}"
+            )
+    if config.demonstration >= len(motions.episodes):
+        last = len(motions.episodes) - 1
+        raise ValueError(f"demonstration: expected a number from 0 to {last}, got {config.demonstration}")
+
+    def compute() -> Clip:
+        own, qpos, learner_qpos = motions.of_episode(config.demonstration)
+        time = np.arange(own[0], own[-1] + 1e-9, 1 / FRAMES_PER_SECOND)
+        at_frames = [np.stack([np.interp(time, own, x) for x in angles.T], axis=1) for angles in (qpos, learner_qpos)]
+        title = f"{Path(config.retargeted).name}, {motions.episodes[config.demonstration]}"
+        return dataclasses.replace(_static_clip(env, title, time - time[0], *at_frames), base=motions.base)
 
     return ClipPlan(env, None, compute)
 

@@ -121,11 +121,13 @@ class RenderConfig:
       split: "held_out" or "train": demonstrations of a policy's run.
       demonstration: index from 0 into the split, or into the file.
       demonstrations: file of the expert's demonstrations.
-      retargeted: file of the learner's motions that `mimic.retarget` computed from `demonstrations`.
-      learner: name of the environment that `retargeted` was computed for; of a run of many arms, name or file of the
-        one that its policy moves.
+      retargeted: file of the learner's motions that `mimic.retarget` computed from `demonstrations`, or folder of the
+        data set that it wrote.
+      learner: name of the environment that the file was computed for; of a data set and of a run of many arms, name or
+        file of the arm.
       locked: numbers or names of the joints of this arm that are locked.
-      expert: model of the arm in `demonstrations`, as of a captured person. Default "": the environment's expert.
+      expert: model of the arm in `demonstrations`, as of a captured person, or of the source of a data set. Default "":
+        the environment's expert.
       limits: the `limits` that `retargeted` was computed with, see `EnvConfig`.
       out: video file. Default "": a file in the folder `videos` of the run directory.
       compilation_cache: see `TrainConfig`.

@@ -27,7 +27,7 @@ from mimic.evaluation.labels import similarity_texts  # noqa: E402
 
 _SIZE, _DPI = (1280, 640), 100  # pixels
 _SCENE = 760, 548  # pixels of the arms' picture
-_LEGEND = "same colour: corresponding links; translucent: expert, scaled to the learner; red: locked joints"
+_LEGEND = "same colour: corresponding links; translucent: expert, {}; red: locked joints"
 _CAPTIONS = 56  # pixels below it; the title is above it
 _LEGEND_ROOM = 1.25  # height of the axes relative to the maximum distance, so that the legend hides no curve
 
@@ -134,7 +134,7 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
 def _image(scene: ArmScene, clip: Clip, frame: int) -> UInt8[np.ndarray, "height width 3"]:
     """Both arms, and the expert's ghost at the learner."""
     poses = [poses[frame] for poses in clip.poses]
-    return scene.image(poses, clip.match.ghost(*poses))
+    return scene.image(poses, clip.match.ghost(*poses, base=clip.base))
 
 
 def _add_scene(figure: Figure, bounds: Bounds, scene: ArmScene, clip: Clip) -> Any:
@@ -145,7 +145,8 @@ def _add_scene(figure: Figure, bounds: Bounds, scene: ArmScene, clip: Clip) -> A
     left, bottom, width, height = bounds
     for place, label in zip(scene.centres(), clip.labels, strict=True):
         figure.text(left + place * width, 0.6 * bottom, label, ha="center", va="center", fontsize=13)
-    figure.text(left + width / 2, 0.2 * bottom, _LEGEND, ha="center", va="center", fontsize=9, color="dimgrey")
+    legend = _LEGEND.format("scaled to the learner" if clip.base is None else "where it is")
+    figure.text(left + width / 2, 0.2 * bottom, legend, ha="center", va="center", fontsize=9, color="dimgrey")
     figure.text(left + 0.02, (1 + bottom + height) / 2, clip.title, va="center", fontsize=12)
     return picture
 

@@ -22,6 +22,7 @@ from mimic.base.config import new_folder
 from mimic.base.files import write_atomically
 from mimic.commands.certificate_plot import plot_certificates
 from mimic.commands.config import RetargetConfig
+from mimic.commands.retargeted_motions import save_motions
 from mimic.metric.config import MetricConfig
 from mimic.motions.formats.episodes import Motion
 from mimic.motions.grippers import other_gripper
@@ -102,6 +103,7 @@ def prepare_data_set(config: RetargetConfig) -> Callable[[], int]:
             lines = write_data_set(data, folder, learner, motions, kept, ranges, yaw)
             report = _report(data, certificates, kept, used, config)
             write_atomically(folder / _REPORT, json.dumps(finite(report), indent=2) + "\n")
+            save_motions(folder, (expert, learner), data.measured, motions[data.entry], used.base)
             plot_certificates(certificates, dt, folder / _PICTURE, f"{expert.name} to {learner.name}, {data.path.name}")
         _print(console, data, certificates, kept, used, lines)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)

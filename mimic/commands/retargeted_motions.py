@@ -1,0 +1,101 @@
+"""The motions of both arms beside a data set that `mimic.retarget` wrote, for videos."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from mimic.arms.embodiment import Embodiment
+from mimic.base.npz import read_arrays
+from mimic.motions.formats.episodes import Motion
+
+MOTIONS = "certificate.npz"
+_ARMS = "expert", "learner"
+_NAMES = (
+    "base",
+    "episodes",
+    "time",
+    "split_points",
+    *(f"{arm}_{what}" for arm in _ARMS for what in ("qpos", "joints")),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class RetargetedMotions:
+    """Episodes of an expert and of a learner, one after the other.
+
+    Attributes:
+      episodes: their names.
+      joints: names of the joints by arm, "expert" and "learner".
+      qpos: [samples, joints] angles by arm [rad].
+      time: of the samples [s].
+      split_points: [episodes + 1] index of the first sample of each, and the number of samples.
+      base: of the learner in the expert's base frame, [x, y, z, yaw] [m, rad].
+    """
+
+    episodes: tuple[str, ...]
+    joints: Mapping[str, tuple[str, ...]]
+    qpos: Mapping[str, Float[np.ndarray, "samples joints"]]
+    time: Float[np.ndarray, " samples"]
+    split_points: np.ndarray
+    base: Sequence[float]
+
+    def of_episode(self, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times of an episode, and the angles of expert and learner."""
+        rows = slice(*self.split_points[number : number + 2])
+        return self.time[rows], self.qpos["expert"][rows], self.qpos["learner"][rows]
+
+
+def save_motions(
+    folder: Path,
+    arms: Sequence[Embodiment],
+    measured: Mapping[str, Motion],
+    motions: Mapping[str, Motion],
+    base: Sequence[float] | None,
+) -> None:
+    """Writes the motions of the learner into a folder, and those that were measured of the expert.
+
+    Args:
+      folder: that exists.
+      arms: expert and learner.
+      measured: of the expert, by episode [rad].
+      motions: of the learner, by episode [rad].
+      base: of the learner in the expert's base frame; None for the same.
+    """
+    own = [measured[name] for name in motions]
+    arrays = {"base": np.zeros(4) if base is None else np.array(base, float), "episodes": np.array(list(motions))}
+    for name, arm, found in zip(_ARMS, arms, (own, motions.values()), strict=True):
+        arrays |= {f"{name}_qpos": np.concatenate([motion.qpos for motion in found])}
+        arrays |= {f"{name}_joints": np.array(arm.joint_names)}
+    arrays["time"] = np.concatenate([motion.time for motion in own])
+    arrays["split_points"] = np.cumsum([0, *(len(motion.time) for motion in own)])
+    np.savez_compressed(folder / MOTIONS, **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def read_motions(folder: Path) -> RetargetedMotions:
+    """The motions in a folder.
+
+    Raises:
+      ValueError: there are none, or they are damaged.
+    """
+    try:
+        arrays = read_arrays(folder / MOTIONS, _NAMES)
+        joints = {arm: tuple(map(str, arrays[f"{arm}_joints"])) for arm in _ARMS}
+        qpos = {arm: np.asarray(arrays[f"{arm}_qpos"], float) for arm in _ARMS}
+        episodes, points = tuple(map(str, arrays["episodes"])), np.asarray(arrays["split_points"], int)
+        time, base = np.asarray(arrays["time"], float), np.asarray(arrays["base"], float).tolist()
+        shapes = [(len(time), len(joints[arm])) for arm in _ARMS]
+        assert shapes == [angles.shape for angles in qpos.values()]
+        assert len(base) == 4
+        assert len(points) == len(episodes) + 1
+        assert points[0] == 0
+        assert points[-1] == len(time)
+        assert (np.diff(points) > 0).all()
+    except (ValueError, KeyError, AssertionError) as error:
+        name = str(folder / MOTIONS)
+        raise ValueError(
+            f"retargeted: expected a folder that mimic.retarget source=DATA wrote, got no {name!r}"
+        ) from error
+    return RetargetedMotions(episodes, joints, qpos, time, points, base)

@@ -1,0 +1,86 @@
+"""The motions beside a data set of `mimic.retarget`, and the videos of them."""
+
+import numpy as np
+import pytest
+
+from mimic.arms.embodiment import panda, planar_arm
+from mimic.commands.clips import prepare_clip
+from mimic.commands.config import RenderConfig
+from mimic.commands.retargeted_motions import MOTIONS, read_motions, save_motions
+from mimic.motions.formats.episodes import Motion
+
+LENGTHS = {"first": 4, "second": 7}
+BASE = [0.1, 0.2, 0.0, 0.5]
+
+
+def motions(joints):
+    return {
+        name: Motion(0.1 * np.arange(length), np.random.default_rng(length).normal(size=(length, joints)), None)
+        for name, length in LENGTHS.items()
+    }
+
+
+@pytest.fixture
+def folder(tmp_path):
+    save_motions(tmp_path, (panda(), planar_arm((0.3,) * 4)), motions(7), motions(4), BASE)
+    return tmp_path
+
+
+def test_an_episode_comes_back(folder):
+    found = read_motions(folder)
+    assert found.episodes == tuple(LENGTHS)
+    assert found.joints == {"expert": panda().joint_names, "learner": planar_arm((0.3,) * 4).joint_names}
+    assert found.base == BASE
+    time, qpos, learner_qpos = found.of_episode(1)
+    np.testing.assert_array_equal(time, motions(7)["second"].time)
+    np.testing.assert_array_equal(qpos, motions(7)["second"].qpos)
+    np.testing.assert_array_equal(learner_qpos, motions(4)["second"].qpos)
+
+
+@pytest.mark.parametrize("damage", ["missing", "truncated", "other arrays"])
+def test_what_is_no_such_folder_is_one_line(folder, damage):
+    content = (folder / MOTIONS).read_bytes()
+    (folder / MOTIONS).unlink()
+    if damage == "truncated":
+        (folder / MOTIONS).write_bytes(content[:-100])
+    if damage == "other arrays":
+        np.savez(folder / MOTIONS, time=np.zeros(3))
+    with pytest.raises(
+        ValueError, match="retargeted: expected a folder that mimic.retarget source=DATA wrote"
+    ) as error:
+        read_motions(folder)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"expert": ""}, "expert: expected with retargeted=FOLDER"),
+        ({"demonstrations": "d.npz"}, "demonstrations: expected none with retargeted=FOLDER"),
+        ({"learner": "panda"}, "learner: expected the arm of the data set, with joints .*, got panda"),
+    ],
+)
+def test_keys_of_a_video_of_a_data_set(tmp_path, changes, message):
+    save_motions(tmp_path, (panda(), planar_arm((0.3,) * 4)), motions(7), motions(4), None)
+    with pytest.raises(ValueError, match=message):
+        prepare_clip(RenderConfig(**{"retargeted": str(tmp_path), "expert": "panda", "learner": "panda"} | changes))
+
+
+def test_a_number_beyond_the_episodes_is_one_line(tmp_path):
+    save_motions(tmp_path, (panda(), panda()), motions(7), motions(7), None)
+    config = RenderConfig(retargeted=str(tmp_path), expert="panda", learner="panda", demonstration=2)
+    with pytest.raises(ValueError, match="demonstration: expected a number from 0 to 1, got 2"):
+        prepare_clip(config)
+
+
+@pytest.mark.slow
+def test_a_video_of_a_data_set_shows_an_episode(tmp_path):
+    save_motions(tmp_path, (panda(), panda()), motions(7), motions(7), BASE)
+    plan = prepare_clip(RenderConfig(retargeted=str(tmp_path), expert="panda", learner="panda", demonstration=1))
+    clip = plan.compute()
+    assert clip.base == BASE
+    assert len(clip.time) == 19  # 0.6 s at 30 frames a second, and the first
+    for poses in clip.poses:
+        np.testing.assert_allclose(poses[::3], motions(7)["second"].qpos, atol=1e-9)  # every 0.1 s
+    ghost = clip.match.ghost(clip.poses[0][0], clip.poses[1][0], base=[0.0] * 4)
+    np.testing.assert_allclose(ghost[-1].start, ghost[-1].end, atol=1e-6)  # both arms are the same, at one place
