@@ -8,7 +8,7 @@ def prepare(config: ViewConfig) -> cli.Work:
     """Prepares a live view. See `mimic.commands.view`."""
     from mimic.commands import view  # slow to import, and not needed for --help
 
-    return view.prepare_view(config)
+    return view.prepare_view(config, cli.overrides())
 
 
 if __name__ == "__main__":

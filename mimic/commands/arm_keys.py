@@ -6,7 +6,7 @@ learner.locked=[3,6], change fields of it, in any order.
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from mimic.arms.arm import ArmConfig
 from mimic.base.overrides import setting
@@ -15,17 +15,13 @@ from mimic.envs import env_config, environments
 ROLES = ("expert", "learner")
 _PREFIXES = {"train": "env.", "demonstrations": "env.", "retarget": "env.", "view": "env.", "inspect": ""}
 _TEMPLATE = "pair"  # the environment whose arms are the user's
-_OWN_ARMS = {  # keys of the command view that bring an arm along
-    "expert": ("run", "mapper", "source"),
-    "learner": ("run",),
-}
 
 
 def expand_arms(arguments: Sequence[str], command: str) -> list[str]:
     """The arguments of a command with the keys of arms in Hydra's syntax; those that name an arm come first.
 
     Raises:
-      ValueError: an environment that has no arms of its own, or arms where they have no effect.
+      ValueError: an environment that has no arms of its own.
     """
     if command not in _PREFIXES:
         return list(arguments)
@@ -39,8 +35,6 @@ def expand_arms(arguments: Sequence[str], command: str) -> list[str]:
         if not equals or role not in ROLES:
             others.append(argument)
             continue
-        if command == "view" and (key := next((key for key in _OWN_ARMS[role] if key in keys), "")):
-            raise ValueError(f"{role}: expected none with {key}=, which brings its own")
         full = f"{_PREFIXES[command]}{role}"
         if not dot and value == _TEMPLATE and sum(other in (role, full) for other in keys) > 1:
             continue  # the pair's arm is the one that another key names
@@ -49,6 +43,22 @@ def expand_arms(arguments: Sequence[str], command: str) -> list[str]:
         else:
             named += _arm(full, role, value)
     return [*named, *others]
+
+
+def check_no_arms(overrides: Sequence[str], reason: str, parts: Collection[str] = (*ROLES, "env")) -> None:
+    """Raises a ValueError for the first override that sets a part of the environment which something else brings along.
+
+    Args:
+      overrides: of the command line, with keys of arms expanded or not.
+      reason: what follows "expected none", such as "with run=".
+      parts: "expert", "learner", and "env" for all else of the environment.
+    """
+    for override in overrides:
+        key = override.partition("=")[0].lstrip("+")
+        role = key.removeprefix("env.").partition(".")[0]
+        part = role if role in ROLES else key.partition(".")[0]
+        if part in parts:
+            raise ValueError(f"{part}: expected none {reason}, which brings its own")
 
 
 def _arm(key: str, role: str, value: str) -> Iterator[str]:

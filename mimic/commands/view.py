@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from rich.console import Console
 from mimic.base import compat
 from mimic.base.config import new_folder
 from mimic.base.distribution import import_extra, install_command
+from mimic.commands.arm_keys import check_no_arms
 from mimic.commands.config import ViewConfig, base_numbers
 from mimic.commands.view_capture import (
     CapturedExpert,
@@ -27,7 +28,6 @@ from mimic.commands.view_capture import (
     wait_for_arm,
 )
 from mimic.commands.view_server import check_port, is_installed, serve
-from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.episodes import EXTRA
@@ -45,15 +45,19 @@ if TYPE_CHECKING:
     from mimic.viewer.playback import Playback
 
 CAPTURE_RATE = 100.0  # frames per second of a captured person, at most
-_DEFAULT = "panda4dof"  # the environment in mimic/conf/view.yaml
 _NUMBERS_RATE = 15.0  # per second, of the numbers, chart and maps, which cost a browser more than the arms
 
 
-def prepare_view(config: ViewConfig) -> Callable[[], int]:
+def prepare_view(config: ViewConfig, overrides: Sequence[str] = ()) -> Callable[[], int]:
     """Checks the config of a view and loads its arms, its pose mapper or its policy.
 
+    Args:
+      config: of the view.
+      overrides: of the command line, of which those without effect are rejected.
+
     Raises:
-      ValueError: viser is not installed, the port is in use, or the arms or the run are invalid.
+      ValueError: viser is not installed, the port is in use, the arms or the run are invalid, or an override has no
+        effect.
     """
     if not is_installed():
         raise ValueError(
@@ -68,7 +72,11 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
 
     use_compilation_cache(config.compilation_cache)
     if config.run:
+        check_no_arms(overrides, "with run=")
         return _prepare_playback(config)
+    for key in ("mapper", "source"):
+        if getattr(config, key):
+            check_no_arms(overrides, f"with {key}=", ("expert",))
     # Poses take less than it takes to wake a thread of XLA's up, which on busy cores has to wait for its turn.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if not config.mapper:
@@ -77,7 +85,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
         return _prepare_captured(config, config.env)
     if not config.mapper:
         return _prepare_live(config, config.env, _session(config, config.env))
-    return _prepare_mapper(config)
+    return _prepare_mapper(config, overrides)
 
 
 def _prepare_live(config: ViewConfig, env: EnvConfig, session: LiveSession) -> Callable[[], int]:
@@ -137,7 +145,7 @@ def _finish(config: ViewConfig, session: LiveSession) -> None:
         print("view: record: nothing was driven, as by hand=relative or the tab 'Hand'", flush=True)
 
 
-def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
+def _prepare_mapper(config: ViewConfig, overrides: Sequence[str]) -> Callable[[], int]:
     """Prepares a view whose learner a pose mapper moves: its own one, or the config's if it takes any.
 
     Raises:
@@ -149,8 +157,7 @@ def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
         env = dataclasses.replace(mapper.env, arms=None, learner=config.env.learner)
         mapper.to(env.learner)
         return _prepare_live(config, env, LiveSession(env, lambda learner: mapper.to(learner).nearest))
-    if config.env.learner != env_config(_DEFAULT).learner:
-        raise ValueError(f"env, learner: expected neither with mapper={config.mapper}, which has one learner")
+    check_no_arms(overrides, f"with mapper={config.mapper}")
     return _prepare_live(config, mapper.env, LiveSession(mapper.env, lambda learner: mapper, can_lock=False))
 
 
