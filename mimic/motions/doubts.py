@@ -19,6 +19,7 @@ _SHIFTS = np.radians([5, 15, 30, 60, 90, -5, -15, -30, -60, -90, 180])  # of zer
 _REFINEMENTS, _NARROWER = 5, 0.2  # rounds, and the factor of the shifts from one to the next
 _CHANGES = 6  # at most
 _LOWER, _MUCH_LOWER = 0.8, 0.3  # fractions of the mean error to which a change lowers it; the latter within tolerance
+_EQUAL = 1.01  # times the least error: a changed sign then counts before the zeros that do the same, 180 deg off
 _STILL, _MOVES = 1e-4, 0.05  # rad: a joint that stands still, and one that moves
 _OTHER_RATE, _MAX_RATIO = 1.25, 100.0  # of stated velocities and those of the angles
 
@@ -86,7 +87,7 @@ def explain(evidence: Evidence, joints: int, most: int = _CHANGES) -> tuple[list
     before = error
     while np.any(before > evidence.tolerance) and len(changes) < most:
         candidates = list(_candidates(none, evidence.has_zeros))
-        change = _best(evidence, rows, candidates)
+        change = _best(evidence, rows, candidates, _EQUAL)
         direction, width = np.sign(np.abs(change.shift)), np.abs(change.shift).max()
         for _ in range(_REFINEMENTS if width else 0):
             shifts = change.shift + width * np.linspace(-1, 1, 11)[:, None] * direction
@@ -99,9 +100,10 @@ def explain(evidence: Evidence, joints: int, most: int = _CHANGES) -> tuple[list
     return changes, error, before
 
 
-def _best(evidence: Evidence, rows: np.ndarray, candidates: Sequence[Change]) -> Change:
-    errors = evidence.errors(np.stack([change.of(rows) for change in candidates]))
-    return candidates[int(errors.mean(axis=1).argmin())]
+def _best(evidence: Evidence, rows: np.ndarray, candidates: Sequence[Change], equal: float = 1.0) -> Change:
+    """The first change of those whose error is at most `equal` times the least."""
+    errors = evidence.errors(np.stack([change.of(rows) for change in candidates])).mean(axis=1)
+    return candidates[int(np.argmax(errors <= equal * errors.min()))]
 
 
 def _candidates(none: Change, has_zeros: bool) -> Iterator[Change]:
