@@ -6,7 +6,7 @@
 A job has `task`, `robot`, `demonstration` (a folder of a recording), `base` [x, y, z, yaw] in the Panda's base frame,
 `motion` (a NumPy file of angles [time, joints]), and `frames` of pictures to write beside it. The objects start where
 the recording has them, and the arm at the first angles. robosuite's joint position control gets the angles of the next
-time, and its gripper the recorded command.
+time, and its gripper the recorded command. A result has, beside success, `hand_lag_mm` and `door_rad` at each time.
 """
 
 import functools
@@ -131,11 +131,15 @@ def replay(job: dict[str, Any], env: Any) -> dict[str, Any]:
         robot.composite_controller.update_state()
         robot.composite_controller.reset()
     joints, ever, error, pictures = qpos.shape[1], False, [], []
+    lag, door = [], []
     for time, action in enumerate(actions):
         goal = qpos[min(time + 1, len(qpos) - 1)]
         env.step(np.concatenate([goal, action[-1:]]))
         ever = bool(env._check_success()) or ever
         error.append(np.abs(env.sim.data.qpos[:joints] - goal).max())
+        lag.append(round(1e3 * hand_lag(env, goal), 2))
+        if job["task"] == "door":
+            door.append(round(float(env.sim.data._data.joint("Door_hinge").qpos[0]), 4))
         if time in job.get("frames", ()):
             pictures.append(picture(env, Path(job["motion"]).with_suffix(f".{time}.png")))
     return {
@@ -144,7 +148,19 @@ def replay(job: dict[str, Any], env: Any) -> dict[str, Any]:
         "objects": objects_done(env),
         "tracking_error_rad": float(np.max(error)),
         "pictures": pictures,
+        "hand_lag_mm": lag,
+        "door_rad": door,
     }
+
+
+def hand_lag(env: Any, goal: np.ndarray) -> float:
+    """Distance [m] of the hand from where it would be at these joint angles."""
+    model, data, site = env.sim.model._model, env.sim.data._data, "gripper0_right_grip_site"
+    at_goal = mujoco.MjData(model)
+    at_goal.qpos[:] = data.qpos
+    at_goal.qpos[: len(goal)] = goal
+    mujoco.mj_kinematics(model, at_goal)
+    return float(np.linalg.norm(at_goal.site(site).xpos - data.site(site).xpos))
 
 
 def picture(env: Any, path: Path) -> str:
