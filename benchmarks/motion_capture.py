@@ -39,9 +39,8 @@ from mimic.motions.mocap.points import SIDES
 from mimic.retargeting.pose_baselines import hand_ik, hold_home
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig
-from mimic.trainers.pose_mapper.mapper_arm import MapperArm
 from mimic.trainers.pose_mapper.model import MapperModel
-from mimic.trainers.pose_mapper.training import mapper_objective, train
+from mimic.trainers.pose_mapper.training import train
 
 _POSES = 64  # of a clip, for the effect of the trunk
 _SPEED = 15.0  # rad/s, of a joint: retargeting passes from one minimum to another within it
@@ -108,21 +107,19 @@ def with_cut_links(case: Case) -> Case:
 def mapped(case: Case) -> np.ndarray:
     """Poses of a mapper that was trained on the same poses."""
     settings = _MAPPER.resolve()
-    arms = (MapperArm.constant(arm) for arm in (case.expert, case.learner))
-    model = MapperModel(EnvConfig(metric=METRIC), settings, *arms)
+    model = MapperModel(EnvConfig(metric=METRIC), settings, case.expert, case.learner)
     shuffled = np.random.default_rng(0).permutation(len(case.qpos))
     poses = jnp.asarray(case.qpos[np.resize(shuffled, settings.samples)], jnp.float32)
     with tempfile.TemporaryDirectory() as folder:
         _, params = train(
-            mapper_objective(model),
-            settings,
+            model,
             lambda: (poses, poses[: settings.validation_poses]),
             Path(folder),
             seed=0,
             on_evaluation=lambda *_: False,
             signals=Signals(),
         )
-    return np.asarray(model.of_poses(params, jnp.asarray(case.qpos, jnp.float32), None, None))
+    return np.asarray(model.of_poses(params, jnp.asarray(case.qpos, jnp.float32)))
 
 
 METHODS: dict[str, Callable[[Case], np.ndarray | None]] = {

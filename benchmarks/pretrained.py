@@ -5,12 +5,10 @@
         [--half] [--commit HASH]
 
 Each run directory becomes the folder ENV-KIND; one that exists is replaced, others stay. Every number of its report is
-that of the stored weights; `copying_distance` is that of copying the angles of joints with the same name. A mapper to
-any arm keeps the rows of the arms in `env.arms.evaluated` in its report, but not their files in its config. `--half`
+that of the stored weights; `copying_distance` is that of copying the angles of joints with the same name. `--half`
 stores matrices as float16. The commit is the one that the runs were trained at; default: that of this checkout.
 """
 
-import dataclasses
 import json
 import subprocess
 import sys
@@ -52,30 +50,23 @@ def make_network(run_dir: Path, out: Path, commit: str, half: bool) -> dict[str,
     """Writes the folder of a run's network, and returns its row of the table."""
     config = load_config(run_dir)
     kind = next(kind for kind, trainer in TRAINERS.items() if trainer == config.trainer.name)
-    if config.env.kind == "sampled_arms" and kind == "policy":
-        raise ValueError(f"{str(run_dir)!r}: expected a pose mapper or a policy of one learner, got one of many arms")
+    if config.env.kind == "sampled_arms":
+        raise ValueError(f"{str(run_dir)!r}: expected a network of one learner, got one of many arms")
     trainer = make_trainer(config, run_dir)
     _, params = load_checkpoint(run_dir, trainer.params_template())
     rounded = jax.tree.map(np.asarray, _rounded(params) if half else params)
     outcome = trainer.evaluate(rounded)
-    stored_config = without_evaluated(config)
     report = {
         **read_json(run_dir / REPORT),
         **trainer.metrics(outcome),
         **trainer.details(outcome),
-        "copying_distance": None if config.env.kind == "sampled_arms" else copying_distance(trainer),
-        SOURCE: {"command": training_command(stored_config), "commit": commit, "matrices": MATRICES[half]},
+        "copying_distance": copying_distance(trainer),
+        SOURCE: {"command": training_command(config), "commit": commit, "matrices": MATRICES[half]},
     }
     folder = out / f"{config.env.name}-{kind}"
     stored = rounded[:2] if kind == "policy" else rounded  # without the value network
-    write_network(folder, stored_config, stored, report, half=half)
+    write_network(folder, config, stored, report, half=half)
     return row(folder, kind, report)
-
-
-def without_evaluated(config: TrainConfig) -> TrainConfig:
-    """The config without the files of arms that only the report of a run needs."""
-    arms = dataclasses.replace(config.env.arms, evaluated=[]) if config.env.arms else None
-    return dataclasses.replace(config, env=dataclasses.replace(config.env, arms=arms))
 
 
 def row(folder: Path, kind: str, report: dict[str, Any]) -> dict[str, Any]:

@@ -17,12 +17,10 @@ FIRST = "panda4dof"  # the environment that the page shows first
 
 
 def scripts() -> dict[str, str]:
-    """The scripts by name: a mapper of each environment of one learner, and "start", which starts the page."""
-    from mimic.trainers.pretrained.network import (
-        names_of_one_learner,  # a second of imports, only where a site is built
-    )
+    """The scripts by name: a mapper of each environment, and "start", which starts the page."""
+    from mimic.trainers.pretrained.network import pretrained_names  # a second of imports, only where a site is built
 
-    names = sorted(names_of_one_learner("pose_mapper"), key=lambda name: (name != FIRST, name))
+    names = sorted(pretrained_names("pose_mapper"), key=lambda name: (name != FIRST, name))
     start = f'mimicDemo.start(document.getElementById("mimic-demo"), {json.dumps(names)});\n'
     return {"start": start} | {name: f"mimicDemo.add({json.dumps(demo_data(name))});\n" for name in names}
 
@@ -38,7 +36,7 @@ def demo_data(name: str) -> dict[str, Any]:
     network = mimic.load(name, "pose_mapper")
     assert isinstance(network.function, mimic.PoseMapper)
     model, params = network.function.model, network.function.params["params"]
-    config, metric = model.config, model.pair().metric
+    config, metric = model.config, model.metric
     if (
         (config.inputs, config.outputs, config.activation) != ("link_states", "circle", "gelu")
         or not metric.is_static
@@ -48,8 +46,8 @@ def demo_data(name: str) -> dict[str, Any]:
     kernels = [params[f"Dense_{i}"] for i in range(len(params))]
     return {
         "name": name,
-        "expert": _arm(model.expert.embodiment),
-        "learner": _arm(model.learner.embodiment),
+        "expert": _arm(model.expert),
+        "learner": _arm(model.learner),
         "correspondence": np.asarray(metric.correspondence).tolist(),
         "weights": {
             "translation": float(metric.weights.translation),  # type: ignore[union-attr]

@@ -63,7 +63,6 @@ from .retargeting.teleoperation import Teleoperator as Teleoperator
 from .retargeting.teleoperation_recording import TeleoperationRecorder as TeleoperationRecorder
 from .retargeting.trajectory import imitate_trajectory as imitate_trajectory
 from .trainers.export.export import export_run as export_run
-from .trainers.pose_mapper.mapper import AnyArmMapper as AnyArmMapper
 from .trainers.pose_mapper.mapper import PoseMapper as PoseMapper
 from .trainers.pretrained.network import Pretrained as Pretrained
 from .trainers.pretrained.network import load as load

@@ -1,7 +1,6 @@
 """The pages' tables of any arm, robots and motion capture: rows of cells, the header first."""
 
 import statistics
-from collections.abc import Sequence
 
 from benchmarks.common.cells import MEASURES, Cells, Results, one, percent, span, where
 
@@ -54,24 +53,7 @@ GROUPS = {
     "unseen locks": "8 sets of locked joints that are not in the training",
     "seven real arms": "7 real arms that are not in the training",
     "random arms": "random arms that are not in the training",
-    "random to other random": "random arms to other random arms, neither in the training",
 }
-
-
-def any_arm_mapper(results: Results) -> list[Cells]:
-    rows: list[Cells] = [
-        ("mean / maximum [%]", "mapper", "16 random guesses", "proposals without Newton steps", "home")
-    ]
-    for group in list(GROUPS)[1:]:
-        seeds = [run["groups"][group] for run in results["mapper"]]
-
-        def column(key: str, form: str = ".2f", seeds: Sequence[Results] = seeds) -> str:
-            return span([seed[key] for seed in seeds], form)
-
-        random = f"{column('quality_random_guesses')} / {column('largest_random_guesses')}"
-        proposals, home = column("quality_proposed", ".0f"), column("quality_from_home", ".0f")
-        rows.append((GROUPS[group], f"{column('quality')} / {column('largest')}", random, proposals, home))
-    return rows
 
 
 def any_arm_policy(results: Results) -> list[Cells]:

@@ -16,7 +16,6 @@ from mimic.evaluation.labels import SPLITS
 from mimic.physics.world import PHYSICS
 from mimic.retargeting.costs import Costs
 from mimic.trainers.config import trainers
-from mimic.trainers.export.config import check_locked
 
 ROBOT_WORLDS = ("nominal", "hardware")
 ROBOTS = ("virtual_panda", "virtual_robot")
@@ -32,6 +31,12 @@ DATASET_FORMATS = ("lerobot", "rosbag2")
 def _factor() -> Any:
     """Field for a factor on masses or damping, as in `RandomizationConfig`."""
     return number(None, at_least=1e-3, at_most=1e3)
+
+
+def _check_locked(locked: list[Any], learner: str) -> None:
+    """Raises a `ValueError` for locked joints without the arm that they belong to."""
+    if locked and not learner:
+        raise ValueError(f"locked: expected with learner=NAME, as in learner=panda locked=[2,4], got {locked}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +90,7 @@ class EvaluateConfig:
         check_ranges(self)
         check_choice("controller", self.controller, CONTROLLERS)
         self._check_robot()
-        check_locked(self.locked, self.learner)
+        _check_locked(self.locked, self.learner)
         if self.split:
             check_choice("split", self.split, ("test",))
             if self.demonstrations or self.robot:
@@ -149,7 +154,7 @@ class RenderConfig:
     def __post_init__(self) -> None:
         check_ranges(self)
         check_choice("split", self.split, SPLITS)
-        check_locked(self.locked, self.learner)
+        _check_locked(self.locked, self.learner)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -415,8 +420,8 @@ class ViewConfig:
 
     Attributes:
       env: environment that defines the arms and the metric.
-      mapper: pose mapper that moves the learner instead of the optimiser: a run directory, or the name of one that
-        comes with mimic, such as "any_arm". Its arms are used; the learner of `env` with one to any arm.
+      mapper: pose mapper that moves the learner instead of the optimiser: a run directory, or the environment
+        of one that comes with mimic. Its arms are used.
       run: run directory of a policy to play. Its arms and demonstrations are used.
       source: motion capture file of a person to play as the expert, or tcp://localhost:PORT, a socket of this machine
         that takes points as lines of JSON.

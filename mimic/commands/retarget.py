@@ -25,7 +25,7 @@ from mimic.motions.demonstrations import Demonstrations, load_demonstrations
 from mimic.retargeting.costs import Costs
 from mimic.retargeting.motions import largest_jump, optimal_motions
 from mimic.retargeting.pose import wrap_angles
-from mimic.trainers.pose_mapper.mapper import PoseMapper, load_mapper
+from mimic.trainers.pose_mapper.mapper import PoseMapper
 from mimic.trainers.progress import similarity_table
 
 
@@ -172,7 +172,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], int | None]:
     capsules = fit_capsules(env.learner, env.limits) if config.costs.of_capsules else None
     mapper = None
     if config.mapper:
-        mapper = load_mapper(Path(config.mapper).expanduser(), learner=env.learner, expert=env.expert)
+        mapper = PoseMapper.load(Path(config.mapper).expanduser())
         mapper.check_fits(expert, learner)
 
     def run() -> None:

@@ -1,7 +1,6 @@
 """`python -m mimic.view`: serves a live view or the playback of a policy until it is interrupted."""
 
 import contextlib
-import dataclasses
 import functools
 import math
 import os
@@ -74,18 +73,16 @@ def prepare_view(config: ViewConfig, overrides: Sequence[str] = ()) -> Callable[
     if config.run:
         check_no_arms(overrides, "with run=")
         return _prepare_playback(config)
-    for key in ("mapper", "source"):
-        if getattr(config, key):
-            check_no_arms(overrides, f"with {key}=", ("expert",))
     # Poses take less than it takes to wake a thread of XLA's up, which on busy cores has to wait for its turn.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    if not config.mapper:
-        config.env.check_one_learner()
+    if config.mapper:
+        check_no_arms(overrides, "with mapper=")
+        return _prepare_mapper(config)
+    config.env.check_one_learner()
     if config.source:
+        check_no_arms(overrides, "with source=", ("expert",))
         return _prepare_captured(config, config.env)
-    if not config.mapper:
-        return _prepare_live(config, config.env, _session(config, config.env))
-    return _prepare_mapper(config, overrides)
+    return _prepare_live(config, config.env, _session(config, config.env))
 
 
 def _prepare_live(config: ViewConfig, env: EnvConfig, session: LiveSession) -> Callable[[], int]:
@@ -145,20 +142,14 @@ def _finish(config: ViewConfig, session: LiveSession) -> None:
         print("view: record: nothing was driven, as by hand=relative or the tab 'Hand'", flush=True)
 
 
-def _prepare_mapper(config: ViewConfig, overrides: Sequence[str]) -> Callable[[], int]:
-    """Prepares a view whose learner a pose mapper moves: its own one, or the config's if it takes any.
+def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
+    """Prepares a view whose learner a pose mapper moves.
 
     Raises:
-      ValueError: there is no such mapper, or a learner does not exist or does not fit it.
+      ValueError: see `PoseMapper.load`.
     """
     mapper = _load_mapper(config)
-    if mapper.takes_any_learner:
-        config.env.check_one_learner()
-        env = dataclasses.replace(mapper.env, arms=None, learner=config.env.learner)
-        mapper.to(env.learner)
-        return _prepare_live(config, env, LiveSession(env, lambda learner: mapper.to(learner).nearest))
-    check_no_arms(overrides, f"with mapper={config.mapper}")
-    return _prepare_live(config, mapper.env, LiveSession(mapper.env, lambda learner: mapper, can_lock=False))
+    return _prepare_live(config, mapper.env, LiveSession(mapper.env, mapper))
 
 
 def _load_mapper(config: ViewConfig) -> "PoseMapper":

@@ -90,8 +90,6 @@ class ArmsConfig:
     """What the learner of each episode is drawn from: three kinds of arms, each with its fraction of their sum.
 
     Attributes:
-      expert: "fixed": the environment's expert; or "drawn": another arm for each training pose, from the same
-        distribution as the learner. Only for `trainer=pose_mapper`.
       locked_fraction: of the environment's learner with joints locked at home, none of them included.
       most_locked: maximum number of joints that are locked.
       unseen: sets of locked joints that training leaves out, as in "2" or "1+4"; the report shows them apart.
@@ -102,7 +100,6 @@ class ArmsConfig:
       armature, damping: minimum of each joint of `models` and `evaluated`, see `ArmConfig`; the default is the Panda's.
     """
 
-    expert: str = "fixed"
     locked_fraction: float = number(0.0, at_least=0.0, at_most=1e6)
     most_locked: int = number(2, at_least=0, at_most=7)
     unseen: list[str] = dataclasses.field(default_factory=list)
@@ -115,7 +112,6 @@ class ArmsConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self, "arms.")
-        check_choice("arms.expert", self.expert, ("fixed", "drawn"))
         if not self.locked_fraction + self.perturbed_fraction + self.random_fraction > 0:
             raise ValueError(
                 "arms: expected locked_fraction, perturbed_fraction or random_fraction above 0, as in env=any_arm, got "

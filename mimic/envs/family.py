@@ -64,12 +64,6 @@ def arm_sampler(config: EnvConfig) -> Sampler:
 
 def check_family(config: EnvConfig) -> None:
     """Raises a ValueError for settings that an environment of many arms does not have."""
-    expert = arms_config(config).expert
-    if expert != "fixed":
-        raise ValueError(
-            f"arms.expert: expected fixed, because demonstrations are of one expert, got {expert}; "
-            "trainer=pose_mapper draws experts"
-        )
     supported = {
         "physics": ("auto", "fused"),
         "start": ("home",),

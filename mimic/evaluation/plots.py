@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _COLOURS = {"train": "tab:blue", "held_out": "tab:orange"}
 _LABELS = {split: name.replace(" ", "-") for split, name in SPLIT_NAMES.items()}  # adjectives: held-out demonstrations
-_MARKERS = ("o", "tab:blue"), ("^", "tab:orange"), ("o", "lightsteelblue"), ("v", "tab:green")  # of an arm's metrics
+_MARKERS = ("o", "tab:blue"), ("^", "tab:orange")  # of an arm's metrics
 _ARM_WIDTH, _MIN_WIDTH = 0.17, 3.0  # inches, of an arm's column and of a panel
 _LINEAR = 0.1  # %: values below it are on a linear axis, as a result at the optimum has the value 0
 
@@ -153,7 +153,7 @@ def plot_arms(
         width_ratios=widths,
     )  # fmt: skip
     for axes, (seen, part) in zip(all_axes[0], parts.items(), strict=True):
-        for (key, text), (marker, colour) in zip(series.items(), _MARKERS, strict=False):
+        for (key, text), (marker, colour) in zip(series.items(), _MARKERS, strict=True):
             percent = [100 * arms[name][key] for name in part]
             axes.plot(range(len(part)), percent, marker, color=colour, label=text, markersize=5)
         axes.set_yscale("symlog", linthresh=_LINEAR)

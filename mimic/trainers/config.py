@@ -203,29 +203,17 @@ class PPOConfig(TrainerConfig):
         return self.batch_size * self.num_minibatches * self.unroll_length
 
 
-# Presets and fields that apply only to a mapper to one learner, and only to one to any arm.
-_MAPPER_PRESETS_OF = {"to one learner": ("paper", "large"), "to any arm (env.arms)": ("any_arm", "any_arm_cpu")}
-_MAPPER_FIELDS_OF = {
-    "to one learner": ("inputs", "outputs", "hidden_layers", "activation"),
-    "to any arm (env.arms)": ("width", "layers", "guesses", "refinements"),
-}
 # Fields of an environment that a mapper does not use: it maps poses and simulates nothing.
 _NOT_OF_MAPPERS = (
     *("demonstrations", "start", "horizon", "preview", "reward", "observation", "limit_weight"),
     *("control_dt", "substeps", "physics", "randomization", "action_scale"),
 )
-ATTENTION_HEADS = 4  # of each layer of the network of any arm
 MAPPER_INPUTS, MAPPER_OUTPUTS, ACTIVATIONS = ("angles", "link_states"), ("tanh", "circle"), ("leaky_relu", "gelu")
 
 
 @dataclasses.dataclass(frozen=True)
 class PoseMapperConfig(TrainerConfig):
     """The neural pose mapper. A field that is None takes its value from the preset.
-
-    If the environment draws its learner (`env.arms`), one network maps to all of these arms: see
-    `mimic.trainers.pose_mapper.networks`. It has `width`, `layers`, `guesses` and `refinements`, and neither
-    `inputs`, `outputs`, `hidden_layers` nor `activation`. A training pose is then a pose of the expert and
-    an arm, and with `env.arms.expert=drawn` the expert is another arm for each pose too.
 
     Attributes:
       name: "pose_mapper".
@@ -234,14 +222,9 @@ class PoseMapperConfig(TrainerConfig):
       inputs: "angles" of the expert (paper), or its "link_states": positions and directions.
       outputs: "tanh", scaled to the joint's range (paper), or "circle": a point on the unit circle for joints whose
         range is a full rotation.
-      heads: number of poses that the network proposes; the nearest one is the output, to any arm after Newton steps.
+      heads: number of poses that the network proposes; the nearest one is the output.
       hidden_layers: widths of the hidden layers.
       activation: "leaky_relu" (paper) or "gelu".
-      width: of a token of the network of any arm; a multiple of 4.
-      layers: transformer layers of the network of any arm.
-      guesses: number of constant poses of the learner, spread over its joints' ranges, which the mapper to any arm
-        improves beside those of its network.
-      refinements: Newton steps of the mapper to any arm from each of these poses; training has none.
       samples: poses in an epoch.
       batch_size: poses in a minibatch; must divide samples.
       fresh: whether each epoch draws new random poses; otherwise all epochs have the same poses, shuffled.
@@ -250,14 +233,13 @@ class PoseMapperConfig(TrainerConfig):
       final_learning_rate: learning rate at the end as a fraction of learning_rate; the decay is a cosine. With 1 the
         rate is constant, without warm-up.
       weight_decay: AdamW's: each update subtracts the fraction learning_rate * weight_decay of every weight; biases do
-        not decay. The presets for one learner do not use it.
+        not decay. The presets do not use it.
       patience: training ends after this many evaluations without a smaller distance on the validation poses; 0 disables
         it.
-      target_quality: training ends early when the quality on the validation poses, or on the arms seen in training, is
-        at most this; 0 disables it.
+      target_quality: training ends early when the quality on the validation poses is at most this; 0 disables it.
       evaluations: number of evaluations and checkpoints.
       validation_poses: number of poses that early stopping is decided on.
-      held_out_poses: number of poses that the report is computed on, the same for each arm.
+      held_out_poses: number of poses that the report is computed on.
     """
 
     length_key: ClassVar[str] = "epochs"
@@ -269,10 +251,6 @@ class PoseMapperConfig(TrainerConfig):
     heads: FromPreset[int] = number(None, at_least=1, at_most=1000)
     hidden_layers: FromPreset[list[int]] = number(None, at_least=1, at_most=2**16, entries=(1, 32))
     activation: FromPreset[str] = _unset()
-    width: FromPreset[int] = number(None, at_least=4, at_most=2**14)
-    layers: FromPreset[int] = number(None, at_least=1, at_most=100)
-    guesses: FromPreset[int] = number(None, at_least=0, at_most=1000)
-    refinements: FromPreset[int] = number(None, at_least=0, at_most=1000)
     samples: FromPreset[int] = number(None, at_least=1, at_most=10**9)
     batch_size: FromPreset[int] = number(None, at_least=1, at_most=10**9)
     fresh: FromPreset[bool] = _unset()
@@ -293,38 +271,27 @@ class PoseMapperConfig(TrainerConfig):
         check_ranges(self, "trainer.")
 
     def resolve(self, backend: str = "cpu", devices: int = 1, *, env: EnvConfig | None = None) -> Self:
-        """See `TrainerConfig.resolve`; without an environment, the preset says whether the learner is any arm."""
-        del devices
-        one, many = _MAPPER_PRESETS_OF
-        is_of_many = self.preset in _MAPPER_PRESETS_OF[many] if env is None else env.kind == "sampled_arms"
-        kind, other = (many, one) if is_of_many else (one, many)
-        auto = "large" if not is_of_many else "any_arm_cpu" if backend == "cpu" else "any_arm"
-        name = auto if self.preset == "auto" else self.preset
-        if name not in (valid := _MAPPER_PRESETS_OF[kind]):
-            raise ValueError(f"trainer.preset: expected {' or '.join(valid)} for a mapper {kind}, got {name}")
-        for field in _MAPPER_FIELDS_OF[other]:
-            if getattr(self, field) is not None:
-                raise ValueError(f"trainer.{field}: expected none for a mapper {kind}, got {getattr(self, field)}")
-        config = _filled_in(self, MAPPER_PRESETS[name], preset=name)
-        config._check(is_of_many)
-        return config
-
-    def _check(self, is_of_many: bool) -> None:
-        """Raises a ValueError for an unknown choice, or a size that another one cannot divide."""
-        if not is_of_many:
-            check_choice("trainer.inputs", str(self.inputs), MAPPER_INPUTS)
-            check_choice("trainer.outputs", str(self.outputs), MAPPER_OUTPUTS)
-            check_choice("trainer.activation", str(self.activation), ACTIVATIONS)
-        elif self.width % ATTENTION_HEADS:
-            raise ValueError(f"trainer.width: expected a multiple of {ATTENTION_HEADS}, got {self.width}")
-        if self.samples % self.batch_size:
+        """See `TrainerConfig.resolve`."""
+        del backend, devices
+        if env is not None and env.kind == "sampled_arms":
             raise ValueError(
-                f"trainer.batch_size: expected a divisor of samples = {self.samples}, got {self.batch_size}"
+                f"trainer: expected ppo where the learner is drawn for each episode, env={env.name}, got pose_mapper, "
+                "which has one learner; imitate_pose takes any arm as data, without a training"
             )
+        name = "large" if self.preset == "auto" else self.preset
+        config = _filled_in(self, MAPPER_PRESETS[name], preset=name)
+        check_choice("trainer.inputs", str(config.inputs), MAPPER_INPUTS)
+        check_choice("trainer.outputs", str(config.outputs), MAPPER_OUTPUTS)
+        check_choice("trainer.activation", str(config.activation), ACTIVATIONS)
+        if config.samples % config.batch_size:
+            raise ValueError(
+                f"trainer.batch_size: expected a divisor of samples = {config.samples}, got {config.batch_size}"
+            )
+        return config
 
     @property
     def total_steps(self) -> int:
-        """Training poses, to any arm each with an arm, counted in every epoch."""
+        """Training poses, counted in every epoch."""
         return self.samples * self.epochs
 
 

@@ -56,11 +56,11 @@ class LiveControls:
     def _add_locks(self) -> None:
         gui, session = self._server.gui, self._session
         self._locks = {
-            name: gui.add_checkbox(f"lock {name}", False, disabled=not session.can_lock) for name in session.joints
+            name: gui.add_checkbox(f"lock {name}", False, disabled=not session.by_optimiser) for name in session.joints
         }
         for name, box in self._locks.items():
             box.on_update(by_user(lambda value, name=name: self._lock(name, value)))
-        self._note = gui.add_markdown("", visible=session.can_lock)
+        self._note = gui.add_markdown("", visible=session.by_optimiser)
         self._show_locks()
 
     def _lock(self, name: str, is_locked: bool) -> None:

@@ -17,7 +17,7 @@ from mimic.viewer.hand_following import FREE, HandDrag, HandFollower, HandFrame,
 from mimic.viewer.tracking import (
     CompiledFunctions,
     FunctionCache,
-    MapperOf,
+    Mapper,
     PoseComparison,
     Settings,
     home_angles,
@@ -68,7 +68,6 @@ class LiveSession:
     Args:
       env: environment that defines the arms and the metric.
       mapper: pose mapper that moves the learner instead of the optimiser.
-      can_lock: whether the learner's joints can be locked and freed.
       hand: how the learner's hand follows, at the start.
       is_recorded: whether what the hand drives is kept.
 
@@ -76,8 +75,7 @@ class LiveSession:
       expert: embodiment of the expert.
       settings: requested settings; they take effect as soon as their functions are compiled.
       hand: how the learner's hand follows, with the optimiser.
-      by_optimiser: whether the optimiser moves the learner, not a pose mapper.
-      can_lock: whether the learner's joints can be locked and freed.
+      by_optimiser: whether the optimiser moves the learner, not a pose mapper, whose joints cannot be locked.
 
     Raises:
       ValueError: an arm is invalid.
@@ -86,15 +84,14 @@ class LiveSession:
     def __init__(
         self,
         env: EnvConfig,
-        mapper: MapperOf | None = None,
-        can_lock: bool = True,
+        mapper: Mapper | None = None,
         hand: HandSettings | None = None,
         is_recorded: bool = False,
     ):
         self.hand: HandSettings = hand or HandSettings()
         self.expert: Embodiment = build_arm(env.expert, env.limits, env.metric.links).embodiment
         self.settings: Settings = initial_settings(env)
-        self.by_optimiser, self.can_lock = mapper is None, can_lock
+        self.by_optimiser = mapper is None
         self._functions = FunctionCache(env, mapper)
         self._lock_angles = lock_angles(env)
         self._lock = threading.RLock()

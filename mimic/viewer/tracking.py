@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from mimic.arms.arm import Arm, ArmConfig, build_arm
+from mimic.arms.arm import Arm, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints
 from mimic.base import registry
@@ -21,7 +21,7 @@ from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line, similarity
 from mimic.retargeting.pose import imitate_pose, wrap_angles
 
-MapperOf = Callable[[ArmConfig], Callable[[Array], Array]]  # learner -> (pose of the expert -> pose of the learner)
+Mapper = Callable[[Array], Array]  # pose of the expert -> pose of the learner [rad]
 
 _MAX_COMPILED = 16  # sets of functions that are kept; each takes some MB
 _TRACKING_ITERATIONS = 8  # Newton steps from the current pose, which is close: sliders move in small steps
@@ -105,11 +105,7 @@ def learner_arm(env: EnvConfig, locked: Mapping[str, float]) -> Arm:
     Raises:
       ValueError: a joint is unknown, or no joint is free.
     """
-    return build_arm(_with_locks(env, locked), env.limits, env.metric.links)
-
-
-def _with_locks(env: EnvConfig, locked: Mapping[str, float]) -> ArmConfig:
-    return dataclasses.replace(env.learner, locked=dict(locked))
+    return build_arm(dataclasses.replace(env.learner, locked=dict(locked)), env.limits, env.metric.links)
 
 
 def home_angles(env: EnvConfig) -> Mapping[str, float]:
@@ -123,9 +119,7 @@ def lock_angles(env: EnvConfig) -> Mapping[str, float]:
     return {**home_angles(env), **build_arm(env.learner, env.limits).locked}
 
 
-def compile_functions(
-    env: EnvConfig, settings: Settings, mapper: MapperOf | None = None
-) -> Iterator[CompiledFunctions]:
+def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None = None) -> Iterator[CompiledFunctions]:
     """Compiles the functions, which takes seconds; yields them first without `best`, then with it.
 
     Args:
@@ -140,11 +134,10 @@ def compile_functions(
     arm = learner_arm(env, settings.locked)
     learner = arm.embodiment
     metric = _metric_of_weights(env, settings, expert, learner)
-    mapped = None if mapper is None else mapper(_with_locks(env, settings.locked))
 
     def track(qpos: Array, current: Array, weights: Array) -> Array:
-        if mapped is not None:
-            return mapped(qpos)
+        if mapper is not None:
+            return mapper(qpos)
         options = {"warm_start": current, "iterations": _TRACKING_ITERATIONS, **metric(weights).arguments}
         return imitate_pose(expert, learner, qpos, **options).qpos
 
@@ -190,7 +183,7 @@ def _compiled(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
 class FunctionCache:
     """Compiled functions by settings, compiled in a background thread, one set at a time."""
 
-    def __init__(self, env: EnvConfig, mapper: MapperOf | None = None):
+    def __init__(self, env: EnvConfig, mapper: Mapper | None = None):
         self._compile = functools.partial(compile_functions, env, mapper=mapper)
         self._results: dict[Any, CompiledFunctions | Exception] = {}
         self._running: Background[None] | None = None

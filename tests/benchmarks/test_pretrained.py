@@ -29,7 +29,7 @@ def test_the_command_names_what_differs_from_the_defaults():
 FOLDERS = sorted(NETWORKS.iterdir())
 
 
-@pytest.mark.slow_for(*(folder.name for folder in FOLDERS if not folder.name.startswith(("any_arm", "planar4dof"))))
+@pytest.mark.slow_for(*(folder.name for folder in FOLDERS if not folder.name.startswith("planar4dof")))
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_the_recorded_commands_are_valid(folder, monkeypatch):
     pages.check(shlex.split(read_json(folder / REPORT)["source"]["command"]), monkeypatch)

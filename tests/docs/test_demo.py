@@ -11,7 +11,7 @@ import pytest
 
 import mimic
 from mimic.retargeting.pose_baselines import copy_joints
-from mimic.trainers.pretrained.network import names_of_one_learner
+from mimic.trainers.pretrained.network import pretrained_names
 from tests.helpers.repository import REPOSITORY
 
 DEMO = REPOSITORY / "docs" / "demo"
@@ -36,18 +36,18 @@ def script_of(name):
     return f"mimicDemo.add({json.dumps(module.demo_data(name))});"
 
 
-@pytest.mark.slow_for(*(name for name in names_of_one_learner("pose_mapper") if name != "planar4dof"))
+@pytest.mark.slow_for(*(name for name in pretrained_names("pose_mapper") if name != "planar4dof"))
 @pytest.mark.skipif(NODE is None, reason="the JavaScript of the demo needs node")
-@pytest.mark.parametrize("name", names_of_one_learner("pose_mapper"))
+@pytest.mark.parametrize("name", pretrained_names("pose_mapper"))
 def test_javascript_computes_what_jax_computes(name):
     mapper = mimic.load(name, "pose_mapper")
     model = mapper.function.model  # type: ignore[attr-defined]
-    pair, poses = model.pair(), random_poses(mapper.expert)
+    poses = random_poses(mapper.expert)
     computed = in_node(script_of(name), poses)
     with jax.enable_x64(True):
         params = jax.tree.map(lambda x: np.asarray(x, np.float64), mapper.function.params)  # type: ignore[attr-defined]
-        answers = np.asarray(jax.jit(jax.vmap(lambda pose: model(params, pair.target(pose))))(poses))
-        distance = jax.jit(jax.vmap(lambda expert, learner: pair.target(expert).distance(learner)))
+        answers = np.asarray(jax.jit(jax.vmap(lambda pose: model(params, pose)))(poses))
+        distance = jax.jit(jax.vmap(model.distance))
         expected = {"mapper": answers, "copy": copy_joints(mapper.expert, mapper.learner, poses)}
         distances = {key: distance(poses, pose) for key, pose in expected.items()}
     for key, pose in expected.items():

@@ -44,7 +44,6 @@ def test_values_without_effect_are_rejected(name, fields, message):
         ({"perturbed_fraction": 1.0}, "arms: expected models and a perturbed_fraction above 0, or neither"),
         ({"random_fraction": 1.0, "unseen": ["2"]}, "arms.unseen: expected with a locked_fraction above 0"),
         ({"locked_fraction": 1.0, "unseen": ["two"]}, "arms.unseen: expected numbers of joints from 1"),
-        ({"locked_fraction": 1.0, "expert": "random"}, "arms.expert: expected one of fixed, drawn, got 'random'"),
     ],
 )
 def test_arms_to_sample_are_checked(fields, message):

@@ -53,10 +53,6 @@ def test_arms_are_named_by_their_files(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"arms": {"expert": "drawn"}},
-            "arms.expert: expected fixed, because demonstrations are of one expert, got drawn",
-        ),
         ({"physics": "mjx"}, "physics: expected auto or fused where the learner is drawn for each episode, got mjx"),
         ({"start": "nearest"}, "start: expected home where .*, got nearest"),
         ({"preview": 2}, "preview: expected 1 where .*, got 2"),

@@ -54,10 +54,6 @@ SMALL = {
         *("trainer.samples=256", "trainer.batch_size=128", "trainer.epochs=1", "trainer.hidden_layers=[8]"),
         *("trainer.held_out_poses=32", "trainer.evaluations=1", "trainer.validation_poses=32"),
     ],
-    "any_arm_mapper": [
-        *("trainer.samples=256", "trainer.batch_size=128", "trainer.epochs=1", "trainer.width=8", "trainer.layers=1"),
-        *("trainer.heads=2", "trainer.held_out_poses=2", "trainer.evaluations=1", "trainer.validation_poses=32"),
-    ],
     "demonstrations": ["env.horizon=5"],
     "figures": ["only=[links,weights]"],
 }
@@ -206,8 +202,6 @@ def _run(words: list[str], folder: pathlib.Path) -> None:
     name = program.removeprefix("mimic.")
     if name == "train":
         name = "pose_mapper" if "trainer=pose_mapper" in arguments else "ppo"
-        if name == "pose_mapper" and "env=any_arm" in arguments:
-            name = "any_arm_mapper"
     if any(word.startswith("resume=") for word in arguments):
         arguments += RESUMED
     else:

@@ -28,8 +28,8 @@ def test_presets_follow_the_backend_and_the_environment():
     assert names == ["cpu", "gpu", "any_arm_cpu", "any_arm", "inner_loop_cpu", "inner_loop"]
     family = TrainConfig(mimic.env_config("panda_family"), PPOConfig())
     assert family.resolve().trainer.network == "joints"  # type: ignore[attr-defined] - the settings of PPO
-    mapper = TrainConfig(mimic.env_config("panda_family"), PoseMapperConfig())
-    assert mapper.resolve("gpu").trainer.preset == "any_arm"
+    for backend in ("cpu", "gpu"):
+        assert PoseMapperConfig().resolve(backend, env=mimic.env_config("panda4dof")).preset == "large"
 
 
 def test_the_network_of_joints_needs_a_drawn_learner():

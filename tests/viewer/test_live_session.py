@@ -202,29 +202,12 @@ def test_a_trained_mapper_moves_the_learner(tmp_path):
     config = TrainConfig(env, trainer, run_dir=str(tmp_path / "run"), compilation_cache="")
     assert train.prepare_training(config, 0.0)() == 0
     mapper = mimic.PoseMapper.load(tmp_path / "run")
-    session = LiveSession(env, lambda learner: mapper, can_lock=False)
+    session = LiveSession(env, mapper)
     session.compile()
     session.move(2, 0.7)
     frame = settle(session)
     np.testing.assert_allclose(list(frame.learner.values()), mapper(session.pose), atol=1e-4)  # float32, two functions
     assert frame.bound < frame.distance  # it has hardly learned anything
-
-
-@pytest.mark.slow
-def test_a_mapper_to_any_arm_moves_a_learner_with_its_locks():
-    mapper = mimic.load("any_arm", "pose_mapper")
-    env = dataclasses.replace(mapper.env, arms=None, learner=env_config("panda4dof").learner)
-    session = LiveSession(env, lambda learner: mapper.to(learner).nearest)
-    session.lock("joint2", True)
-    session.compile()
-    session.move(3, -1.2)
-    frame = settle(session)
-    locked = dict.fromkeys(("joint2", "joint3", "joint6", "joint7"), 0.0)
-    expected = mapper(session.pose, ArmConfig(locked=locked))
-    free = [angle for name, angle in frame.learner.items() if name not in frame.locked]
-    assert set(frame.locked) == set(locked)
-    np.testing.assert_allclose(free, expected, atol=1e-4)  # float32, two functions
-    assert frame.bound <= frame.distance
 
 
 def test_locking_the_last_joint_is_rejected_and_undone():

@@ -2,13 +2,12 @@
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
 from rich.console import Console
 
-from mimic.arms.arm import ArmConfig
 from mimic.base.config import check_choice, new_file, new_folder
 from mimic.base.distribution import import_extra
 from mimic.runs.checkpoints import check_checkpoint
@@ -27,23 +26,19 @@ def export_run(
     out: str | os.PathLike[str],
     *,
     format: Literal["onnx", "controller"] = "onnx",
-    learner: str = "",
-    locked: Sequence[int | str] = (),
     checkpoint: int | None = None,
 ) -> Path:
     """Writes the policy of one arm or the pose mapper of a run to a file that other programs can run without mimic.
 
     A policy maps `observation` [batch, observations] to `action` [batch, joints] in [-1, 1], without exploration, and
     to `torque` [N m]. A pose mapper maps `expert_qpos` [batch, joints] to `learner_qpos` [batch, learner_joints], both
-    in rad; that of a mapper to any arm takes one pose a call. The file includes the normalisation of inputs and the
+    in rad. The file includes the normalisation of inputs and the
     scaling of outputs.
 
     Args:
       run: run directory.
       out: exported file; must not exist.
       format: "onnx", or "controller", a folder for `mimic.deploy`, see `prepare_controller`.
-      learner: of a mapper to any arm, the arm that it maps to (see `ArmConfig.model`); the environment's where empty.
-      locked: numbers or names of the joints of this arm that are locked.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
 
     Returns:
@@ -53,7 +48,7 @@ def export_run(
       ValueError: the run or the checkpoint does not exist, it is a policy of many arms, the file cannot be written, the
         format is unknown, or a package that it needs is not installed.
     """
-    write, _ = _writer(ExportConfig(os.fspath(run), os.fspath(out), format, learner, list(locked), checkpoint))
+    write, _ = _writer(ExportConfig(os.fspath(run), os.fspath(out), format, checkpoint))
     write()
     return Path(out).expanduser()
 
@@ -83,7 +78,6 @@ def _writer(config: ExportConfig) -> tuple[Callable[[], None], str]:
         _check_packages(config.format)
         out = new_folder("out", config.out)
         write = prepare_controller(_run_dir(config), config.checkpoint)
-        _check_no_learner(config)
         return lambda: write(out), ""
     out = new_file("out", config.out)
     if not os.access(out.parent, os.W_OK):
@@ -125,23 +119,12 @@ def exported_function(config: ExportConfig) -> ExportedFunction:
     """The function of a run's network."""
     run_dir, trained = _run_dir(config), _exportable(config)
     steps = check_checkpoint(run_dir, config.checkpoint)
-    if trained.env.kind != "sampled_arms":
-        _check_no_learner(config)
-    name, locked = config.learner, config.locked
-    return make_function(trained, run_dir, steps, ArmConfig(model=name, locked=locked) if locked else name or None)
-
-
-def _check_no_learner(config: ExportConfig) -> None:
-    """Raises a `ValueError` for an arm that a run of one learner does not take."""
-    if config.learner:
-        raise ValueError(f"learner: expected none for a run of one learner, got {config.learner!r}")
+    return make_function(trained, run_dir, steps)
 
 
 def _write(exported: ExportedFunction, out: Path) -> None:
     texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in exported.metadata.items()}
-    content = to_onnx(
-        exported.function, name=exported.kind, inputs=exported.inputs, metadata=texts, has_batch=exported.has_batch
-    )
+    content = to_onnx(exported.function, name=exported.kind, inputs=exported.inputs, metadata=texts)
     partial = out.with_name(out.name + ".partial")
     partial.write_bytes(content)
     os.replace(partial, out)

@@ -14,8 +14,7 @@ from mimic.base.distribution import VERSION
 from mimic.envs.imitation import layout_of, observation_layout, torque_scale
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.pose_mapper.mapper import load_mapper
-from mimic.trainers.pose_mapper.mapper_arm import NamedArm
+from mimic.trainers.pose_mapper.mapper import PoseMapper
 from mimic.trainers.ppo import ppo
 from mimic.trainers.ppo.trainer import run_environment
 
@@ -29,29 +28,23 @@ class ExportedFunction:
       kind: "policy" or "pose_mapper".
       inputs: length of each input by its name.
       metadata: meaning and units of inputs and outputs.
-      has_batch: whether it is exported for any number of samples at once, or for one.
     """
 
     function: Callable[..., dict[str, jax.Array]]
     kind: str
     inputs: dict[str, int]
     metadata: dict[str, Any]
-    has_batch: bool = True
 
 
-def make_function(trained: TrainConfig, run_dir: Path, steps: int, learner: NamedArm | None = None) -> ExportedFunction:
+def make_function(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFunction:
     """Makes the function of a run's network.
 
     Args:
       trained: config of the run.
       run_dir: run directory.
       steps: of the checkpoint, which exists.
-      learner: of a mapper to any arm; see `load_mapper`.
-
-    Raises:
-      ValueError: a learner that the mapper does not take.
     """
-    exported = _policy(trained, run_dir, steps) if trained.trainer.name == "ppo" else _mapper(run_dir, steps, learner)
+    exported = _policy(trained, run_dir, steps) if trained.trainer.name == "ppo" else _mapper(run_dir, steps)
     common = {
         "mimic_version": VERSION,
         "env": trained.env.name,
@@ -92,12 +85,11 @@ def _policy(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFunction
     return ExportedFunction(function, "policy", {"observation": size}, metadata)
 
 
-def _mapper(run_dir: Path, steps: int, learner: NamedArm | None) -> ExportedFunction:
-    """A pose mapper to one arm, whether it was trained for that one or takes any."""
-    mapper = load_mapper(run_dir, steps, learner)
+def _mapper(run_dir: Path, steps: int) -> ExportedFunction:
+    mapper = PoseMapper.load(run_dir, steps)
 
     def function(expert_qpos: jax.Array) -> dict[str, jax.Array]:
-        return {"learner_qpos": mapper.nearest(expert_qpos)}
+        return {"learner_qpos": mapper.model(mapper.params, expert_qpos)}
 
     metadata: dict[str, Any] = {
         **_names(mapper.expert, mapper.learner),
@@ -107,8 +99,7 @@ def _mapper(run_dir: Path, steps: int, learner: NamedArm | None) -> ExportedFunc
         "learner_range": _joint_ranges(mapper.learner),
     }
     inputs = {"expert_qpos": mapper.expert.num_joints}
-    # The Newton steps of a mapper to any arm are many operations, which take minutes to convert for any batch size.
-    return ExportedFunction(function, "pose_mapper", inputs, metadata, has_batch=mapper.model.learner is not None)
+    return ExportedFunction(function, "pose_mapper", inputs, metadata)
 
 
 def _names(expert: Embodiment, learner: Embodiment) -> dict[str, Any]:

@@ -21,7 +21,6 @@ from mimic.base import compat
 
 OPSET, IR_VERSION = 18, 8  # of 2022: all runtimes since then read them
 TOLERANCE = 1e-5  # of float32, with sums in another order
-_LONG_TOLERANCE = 1e-4  # of functions without a batch: Newton steps magnify rounding errors
 # Where two candidates of a mapper are equally good, or an angle is at the seam of the circle, rounding decides.
 _EQUAL_SAMPLES, _SAMPLES = 0.75, 32
 
@@ -32,7 +31,6 @@ def to_onnx(
     name: str,
     inputs: Mapping[str, int],
     metadata: Mapping[str, str] | None = None,
-    has_batch: bool = True,
 ) -> bytes:
     """Converts a function of float32 vectors to an ONNX model of inputs [batch, length].
 
@@ -41,7 +39,6 @@ def to_onnx(
       name: name of the graph.
       inputs: length of the vector of each input.
       metadata: `metadata_props` of the model.
-      has_batch: for any batch size; otherwise it is 1, which takes a third of the operations where there are many.
 
     Raises:
       ValueError: the model's outputs are not those of the function.
@@ -58,13 +55,11 @@ def to_onnx(
     single = jaxpr_as_fun(jax.make_jaxpr(lambda *vectors: _run(traced.jaxpr, traced.consts, vectors))(*vectors))
 
     def batched(*arrays: jax.Array) -> Sequence[jax.Array]:
-        if has_batch:
-            return jax.vmap(lambda *vectors: tuple(single(*vectors)))(*arrays)
-        return [result[None] for result in single(*(array[0] for array in arrays))]
+        return jax.vmap(lambda *vectors: tuple(single(*vectors)))(*arrays)
 
     model = jax2onnx.to_onnx(
         batched,
-        [("batch" if has_batch else 1, size) for size in inputs.values()],
+        [("batch", size) for size in inputs.values()],
         model_name=name,
         opset=OPSET,
         input_names=list(inputs),
@@ -77,7 +72,7 @@ def to_onnx(
     content = model.SerializeToString()
     rng = np.random.default_rng(0)
     samples = {key: rng.normal(size=(_SAMPLES, size)).astype(np.float32) for key, size in inputs.items()}
-    _check(content, function, samples, has_batch)
+    _check(content, function, samples)
     return content
 
 
@@ -85,25 +80,21 @@ def _check(
     content: bytes,
     function: Callable[..., Mapping[str, jax.Array]],
     inputs: Mapping[str, np.ndarray],
-    has_batch: bool,
 ) -> None:
     """Raises a `ValueError` unless ONNX Runtime computes the function."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    count = len(next(iter(inputs.values())))
-    parts = [slice(None)] if has_batch else [slice(i, i + 1) for i in range(count)]
-    tolerance = TOLERANCE if has_batch else _LONG_TOLERANCE
-    rows = [session.run(None, {name: values[part] for name, values in inputs.items()}) for part in parts]
+    actual = session.run(None, dict(inputs))
     expected = jax.jit(jax.vmap(function))(*inputs.values())
-    for output, *actual in zip(session.get_outputs(), *rows, strict=True):
-        values, reference = np.concatenate(actual), np.asarray(expected[output.name])
+    for output, values in zip(session.get_outputs(), actual, strict=True):
+        reference = np.asarray(expected[output.name])
         if values.shape != reference.shape:
             raise ValueError(f"onnx: {output.name}: expected the shape {reference.shape} of JAX, got {values.shape}")
         error = np.abs(values - reference).max(axis=1) / max(1.0, float(np.abs(reference).max()))
-        if not np.mean(error <= tolerance) >= _EQUAL_SAMPLES:  # not a number is an error too
+        if not np.mean(error <= TOLERANCE) >= _EQUAL_SAMPLES:  # not a number is an error too
             raise ValueError(
-                f"onnx: {output.name}: expected the values of JAX to {tolerance:g}, got a median error of "
+                f"onnx: {output.name}: expected the values of JAX to {TOLERANCE:g}, got a median error of "
                 f"{np.median(error):g}"
             )
 

@@ -11,152 +11,127 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-from mimic.arms.arm import build_arm
-from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import continuous_joints
 from mimic.base.compilation import on_host
 from mimic.envs.config import EnvConfig
-from mimic.metric.config import check_metric
-from mimic.metric.distance import DistanceWeights
+from mimic.metric.distance import Metric
+from mimic.metric.kinematics import LinkStates, link_states
+from mimic.retargeting.pose import wrap_angles
 from mimic.trainers.config import PoseMapperConfig
-from mimic.trainers.pose_mapper.mapper_arm import MapperArm
-from mimic.trainers.pose_mapper.networks import FullyConnected, JointTokens
-from mimic.trainers.pose_mapper.pair import Arm, Pair, Poses, Target, poses_within_range
 
 Params = Any
+Poses = Float[Array, "poses learner_joints"]
+_ACTIVATIONS = {"leaky_relu": nn.leaky_relu, "gelu": nn.gelu}
+
+
+class _Network(nn.Module):
+    """A fully connected network; arguments as of `PoseMapperConfig`, and the learner's number of joints."""
+
+    heads: int
+    joints: int
+    hidden_layers: tuple[int, ...]
+    activation: str
+
+    @nn.compact
+    def __call__(self, x: Float[Array, " inputs"]) -> Float[Array, "heads joints 2"]:
+        """Two numbers for each joint of each head, see `MapperModel.candidates`."""
+        for width in self.hidden_layers:
+            x = _ACTIVATIONS[self.activation](nn.Dense(width)(x))
+        return jnp.reshape(nn.Dense(self.heads * self.joints * 2)(x), (self.heads, self.joints, 2))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MapperModel:
-    """A mapper without its parameters: pure functions of one pose; batch with `jax.vmap`.
+    """A mapper without its parameters: pure functions of one pose of the expert [rad]; batch with `jax.vmap`.
 
     Attributes:
       env: its metric defines the nearest pose, and chooses among those that the network proposes.
       config: settings of the network.
-      expert: the environment's expert.
-      learner: the learner; None for any learner, whose description is then an input of the network.
+      expert: n joints.
+      learner: n_hat joints.
     """
 
     env: EnvConfig
     config: PoseMapperConfig
-    expert: MapperArm
-    learner: MapperArm | None
-
-    @property
-    def takes_any_expert(self) -> bool:
-        """Whether the expert may be any arm too."""
-        return self.learner is None and self.env.arms is not None and self.env.arms.expert == "drawn"
-
-    @property
-    def embodiments(self) -> tuple[Embodiment, Embodiment]:
-        """Expert and learner of a mapper that has one pair."""
-        assert self.learner is not None
-        return self.expert.embodiment, self.learner.embodiment
-
-    @property
-    def starts(self) -> int:
-        """Number of poses from which it takes Newton steps."""
-        return self.config.heads + (self.config.guesses or 0)
+    expert: Embodiment
+    learner: Embodiment
 
     @functools.cached_property
-    def weights(self) -> DistanceWeights:
-        """The metric's weights, where the learner may be any arm."""
-        return check_metric(self.env.metric)
-
-    @functools.cached_property
-    def _own_pair(self) -> Pair:
-        assert self.learner is not None
+    def metric(self) -> Metric:
+        """The metric between the two arms."""
         # A cached value must not be a tracer of the first function that is traced with it. On the host because the
         # first computation on a GPU takes seconds to start.
         with jax.ensure_compile_time_eval(), on_host():
-            metric = self.env.metric.build(self.expert.embodiment, self.learner.embodiment)
+            metric = self.env.metric.build(self.expert, self.learner)
             if not callable(metric.correspondence):
                 metric = dataclasses.replace(metric, correspondence=np.asarray(metric.correspondence))
-            return Pair(self.expert.data, self.learner.data, metric)
+            return metric
 
-    def pair(self, learner: Arm | None = None, expert: Arm | None = None) -> Pair:
-        """The arms of a mapping: the model's own ones, or any learner and, where the model takes any, any expert."""
-        if self.learner is not None:
-            return self._own_pair
-        # XLA computes with a constant what it can while it compiles, which rounds otherwise than an argument does.
-        expert = expert if self.takes_any_expert and expert is not None else self.expert.data
-        assert isinstance(expert, ArmArrays) and isinstance(learner, ArmArrays)
-        return Pair.of_arrays(expert, learner, self.weights)
-
-    @functools.cached_property
+    @property
     def _network(self) -> nn.Module:
         config = self.config
-        if self.learner is not None:
-            return FullyConnected(config.heads, tuple(config.hidden_layers), config.activation, config.inputs)
-        links = MAX_LINKS if self.takes_any_expert else self.expert.embodiment.num_links
-        return JointTokens(config.heads, config.width, config.layers, links)
+        return _Network(config.heads, self.learner.num_joints, tuple(config.hidden_layers), config.activation)
 
     def init(self, key: Array) -> Params:
         """Random parameters."""
-        target = self.pair(self.expert.data).target(jnp.zeros(len(self.expert.data.joint_range)))
-        return self._network.init(key, target)
+        return self._network.init(key, self._inputs(jnp.zeros(self.expert.num_joints)))
 
-    def candidates(self, params: Params, target: Target) -> Poses:
-        """The poses that the heads propose [rad]; locked joints stay at home.
+    def _inputs(self, qpos: Float[Array, " joints"]) -> Float[Array, " inputs"]:
+        if self.config.inputs == "link_states":
+            return self._link_inputs(link_states(self.expert, qpos))
+        lower, upper = (jnp.asarray(bound, qpos.dtype) for bound in np.asarray(self.expert.joint_range).T)
+        return (2 * wrap_angles(qpos, continuous_joints(self.expert)) - lower - upper) / (upper - lower)
 
-        Args:
-          params: parameters of the network.
-          target: the arms, with the expert in its pose.
+    def _link_inputs(self, states: LinkStates) -> Array:
+        assert states.direction is not None
+        has_hand = not self.metric.hand_weights.are_zero
+        parts = [states.position, states.direction, *([states.hand.axes] if has_hand and states.hand else [])]
+        return jnp.concatenate([part.ravel() for part in parts])
+
+    def candidates(self, params: Params, qpos: Float[Array, " joints"]) -> Poses:
+        """The poses that the heads propose [rad].
+
+        Of two numbers for each joint the first one suffices for joints with limits. With the output "circle" they are a
+        point whose direction is the angle of a joint that rotates by a full revolution, continuous in them at pi.
         """
-        outputs: Any = self._network.apply(params, target)
-        return poses_within_range(target.pair.learner, outputs, on_circle=self.config.outputs != "tanh")
+        outputs: Any = self._network.apply(params, self._inputs(qpos))
+        lower, upper = (jnp.asarray(bound, outputs.dtype) for bound in np.asarray(self.learner.joint_range).T)
+        poses = (lower + upper) / 2 + (upper - lower) / 2 * jnp.tanh(outputs[..., 0])
+        if self.config.outputs == "tanh":
+            return poses
+        return jnp.where(continuous_joints(self.learner), jnp.arctan2(outputs[..., 1], outputs[..., 0]), poses)
 
-    def initial_poses(self, params: Params, target: Target) -> Poses:
-        """The poses of the heads, then `guesses` that do not depend on the expert [rad]."""
-        proposed, learner = self.candidates(params, target), target.pair.learner
-        if not self.config.guesses:
-            return proposed
-        assert isinstance(learner, ArmArrays)
-        lower, upper = learner.joint_range[:, 0], learner.joint_range[:, 1]
-        guesses = lower + _spread(self.config.guesses) * (upper - lower)
-        return jnp.concatenate([proposed, jnp.where(learner.is_free > 0, guesses, learner.home)])
+    def distances(self, qpos: Float[Array, " joints"], poses: Poses) -> Float[Array, " poses"]:
+        """Embodiment distances between a pose of the expert and poses of the learner [rad], at rest."""
+        states = link_states(self.expert, qpos)
+        return jax.vmap(lambda pose: self.metric(states, link_states(self.learner, pose)))(poses)
 
-    def improved(self, params: Params, target: Target) -> Poses:
-        """The initial poses after the Newton steps [rad]."""
-        poses = self.initial_poses(params, target)
-        return target.improved(poses, self.config.refinements) if self.config.refinements else poses
+    def distance(self, qpos: Float[Array, " joints"], learner_qpos: Float[Array, " learner_joints"]) -> Array:
+        """Embodiment distance between a pose of the expert and one of the learner [rad], at rest."""
+        return self.metric(link_states(self.expert, qpos), link_states(self.learner, learner_qpos))
 
-    def __call__(self, params: Params, target: Target) -> Float[Array, " learner_joints"]:
-        """The nearest of the poses after the Newton steps [rad]."""
-        poses = self.improved(params, target)
-        return poses[0] if len(poses) == 1 else target.nearest(poses)[1]
+    def __call__(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, " learner_joints"]:
+        """The nearest of the poses that the heads propose [rad]."""
+        poses = self.candidates(params, qpos)
+        return poses[0] if len(poses) == 1 else poses[jnp.argmin(self.distances(qpos, poses))]
 
     @functools.cached_property
-    def of_poses(self) -> Callable[..., Float[Array, "poses learner_joints"]]:
-        """(parameters, poses of the expert, learner, expert) -> poses [rad], compiled once whatever the arms are.
-
-        The arms are arrays, or None where the mapper has its own ones.
-        """
-
-        def of_pose(params: Params, qpos: Array, learner: Any, expert: Any) -> Array:
-            return self(params, self.pair(learner, expert).target(qpos))
-
-        return jax.jit(jax.vmap(of_pose, (None, 0, None, None)))
+    def of_poses(self) -> Callable[[Params, Float[Array, "poses joints"]], Poses]:
+        """(parameters, poses of the expert) -> poses [rad], compiled once for each number of poses."""
+        return jax.jit(jax.vmap(self, (None, 0)))
 
 
 def make_model(env: EnvConfig, config: PoseMapperConfig) -> MapperModel:
     """The untrained mapper of an environment's arms and metric.
 
     Raises:
-      ValueError: arms that cannot be loaded; where the learner is drawn, an expert that has no arrays, or a metric
-        other than of constant weights.
+      ValueError: arms that cannot be loaded.
     """
-    if env.kind != "sampled_arms":
-        return MapperModel(env, config, *(MapperArm.constant(arm) for arm in env.build_arms().embodiments))
-    model = MapperModel(env, config, MapperArm.without_locks(build_arm(env.expert, env.limits, env.metric.links)), None)
-    _ = model.weights
-    return model
+    return MapperModel(env, config, *env.build_arms().embodiments)
 
 
-def _spread(count: int) -> Float[np.ndarray, "count joints"]:
-    """Points that fill the unit cube evenly: the additive recurrence of M. Roberts (2018), which never changes."""
-    root = 2.0
-    for _ in range(64):
-        root = (1 + root) ** (1 / (MAX_JOINTS + 1))  # solves x^(joints + 1) = x + 1
-    steps = root ** -np.arange(1.0, MAX_JOINTS + 1)
-    return ((0.5 + np.outer(np.arange(1, count + 1), steps)) % 1).astype(np.float32)
+def random_poses(arm: Embodiment, key: Array, count: int) -> Float[Array, "count joints"]:
+    """Poses [rad], uniform within the joints' ranges."""
+    lower, upper = jnp.asarray(arm.joint_range, jnp.float32).T
+    return jax.random.uniform(key, (count, len(lower)), jnp.float32, minval=lower, maxval=upper)

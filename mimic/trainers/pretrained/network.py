@@ -5,7 +5,7 @@ import functools
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Literal, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -14,13 +14,11 @@ from jaxtyping import Array, Float
 from mimic.arms.embodiment import Embodiment
 from mimic.base import compat
 from mimic.base.config import check_choice
-from mimic.envs import env_config
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.pretrained.files import SOURCE, read_config_and_report, read_params
 
 if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv
-    from mimic.trainers.pose_mapper.mapper import PoseMapper
 
 NETWORKS = Path(__file__).parent / "networks"
 TRAINERS = {"policy": "ppo", "pose_mapper": "pose_mapper"}  # of each kind of network
@@ -94,15 +92,7 @@ class Pretrained:
         return self._arms[1]
 
 
-@overload
-def load(name: Literal["any_arm"], kind: Literal["pose_mapper"]) -> "PoseMapper": ...
-
-
-@overload
-def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> Pretrained: ...
-
-
-def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> "Pretrained | PoseMapper":
+def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> Pretrained:
     """Loads a trained network that comes with mimic. Nothing is downloaded.
 
     Args:
@@ -110,26 +100,19 @@ def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> "Pretr
       kind: "policy", or "pose_mapper".
 
     Returns:
-      The network; of `load("any_arm", "pose_mapper")` a `PoseMapper`, which takes the learner as a second argument.
+      The network.
 
     Raises:
       ValueError: there is no such network.
     """
     check_choice("kind", kind, tuple(TRAINERS))
     check_choice("name", name, pretrained_names(kind))
-    folder = NETWORKS / f"{name}-{kind}"
-    network = read_network(folder, kind)
-    return network.function if env_config(name).kind == "sampled_arms" else network  # type: ignore[return-value]
+    return read_network(NETWORKS / f"{name}-{kind}", kind)
 
 
 def pretrained_names(kind: str) -> tuple[str, ...]:
     """The environments with a trained network of this kind."""
     return tuple(sorted(path.name.removesuffix(f"-{kind}") for path in NETWORKS.glob(f"*-{kind}")))
-
-
-def names_of_one_learner(kind: str) -> tuple[str, ...]:
-    """The environments with a trained network of this kind that do not draw their learner."""
-    return tuple(name for name in pretrained_names(kind) if env_config(name).kind != "sampled_arms")
 
 
 def read_network(folder: Path, kind: str) -> Pretrained:
@@ -141,7 +124,7 @@ def read_network(folder: Path, kind: str) -> Pretrained:
     config, report = read_config_and_report(folder)
     if config.trainer.name != TRAINERS[kind]:
         raise ValueError(f"{str(folder)!r}: expected a network of trainer={TRAINERS[kind]}, got {config.trainer.name}")
-    function = _policy(folder, config) if kind == "policy" else _mapper(folder, config, report)
+    function = _policy(folder, config) if kind == "policy" else _mapper(folder, config)
     return Pretrained(config.env.name, kind, config, report, function)
 
 
@@ -180,7 +163,7 @@ def _policy(folder: Path, config: TrainConfig) -> Function:
     return policy
 
 
-def _mapper(folder: Path, config: TrainConfig, report: dict[str, Any]) -> Function:
+def _mapper(folder: Path, config: TrainConfig) -> Function:
     from mimic.trainers.pose_mapper.mapper import PoseMapper  # imports flax networks
 
-    return PoseMapper.read(config, lambda template: read_params(folder, template), report)
+    return PoseMapper.read(config, lambda template: read_params(folder, template))

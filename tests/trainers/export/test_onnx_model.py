@@ -32,21 +32,19 @@ def rows(x):
     return jnp.tile(jnp.pad(jnp.concatenate(parts), (1, 2), constant_values=3), 2) + jnp.stack([x[0], x[1]])[1]
 
 
-@pytest.mark.parametrize("has_batch", [True, False], ids=["batch", "one"])
-def test_the_model_is_the_function(has_batch):
+def test_the_model_is_the_function():
     model = to_onnx(
         lambda x: {"loop": loop(x), "rows": rows(x)},
         name="model",
         inputs={"x": 6},
         metadata={"unit": "rad"},
-        has_batch=has_batch,
     )
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    x = np.random.default_rng(1).normal(size=(5 if has_batch else 1, 6)).astype(np.float32)
+    x = np.random.default_rng(1).normal(size=(5, 6)).astype(np.float32)
     for function, actual in zip((loop, rows), session.run(["loop", "rows"], {"x": x}), strict=True):
         np.testing.assert_allclose(actual, jax.vmap(function)(x), rtol=1e-5, atol=1e-6)
     assert session.get_modelmeta().custom_metadata_map == {"unit": "rad"}
-    assert session.get_inputs()[0].shape[0] == ("batch" if has_batch else 1)
+    assert session.get_inputs()[0].shape[0] == "batch"
 
 
 def test_a_model_with_other_values_is_rejected(monkeypatch):

@@ -9,19 +9,17 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.envs.family import UNSEEN, report_arms
 from mimic.evaluation.evaluator import Evaluator
 from mimic.runs.files import REPORT
-from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
 from mimic.trainers.pretrained.files import PARAMETERS, read_params, write_network
-from mimic.trainers.pretrained.network import NETWORKS, TRAINERS, names_of_one_learner, pretrained_names, read_network
+from mimic.trainers.pretrained.network import NETWORKS, TRAINERS, pretrained_names, read_network
 
 MAX_BYTES = 5_000_000  # of all of them: the package stays small
 OBSERVATION = 246  # numbers that the policy of planar4dof observes
 DEFAULT = ("panda3dof", "panda4dof", "panda7dof", "planar4dof", "planar7dof")
-POLICIES, MAPPERS = (names_of_one_learner(kind) for kind in TRAINERS)
-FOLDERS = [f"{name}-{kind}" for kind in TRAINERS for name in names_of_one_learner(kind)]
+POLICIES, MAPPERS = (pretrained_names(kind) for kind in TRAINERS)
+FOLDERS = [f"{name}-{kind}" for kind in TRAINERS for name in pretrained_names(kind)]
 
 
 def quick(names):
@@ -30,8 +28,7 @@ def quick(names):
 
 
 def test_each_default_environment_has_both_and_they_are_small():
-    assert MAPPERS == POLICIES == DEFAULT == pretrained_names("policy")
-    assert pretrained_names("pose_mapper") == ("any_arm", *DEFAULT)
+    assert MAPPERS == POLICIES == DEFAULT
     assert sum(path.stat().st_size for path in NETWORKS.rglob("*") if path.is_file()) <= MAX_BYTES
 
 
@@ -51,7 +48,8 @@ def test_each_says_where_it_comes_from(folder):
 @pytest.mark.parametrize("name", quick(MAPPERS))
 def test_a_mapper_reaches_its_recorded_distance(name):
     mapper = mimic.load(name, "pose_mapper")
-    poses = PoseMapperTrainer(mapper.config).pairs["arms"].expert_qpos[-mapper.config.trainer.held_out_poses :]
+    trainer = PoseMapperTrainer(mapper.config)
+    poses = trainer.poses[-trainer.settings.held_out_poses :]
     distance = jax.jit(jax.vmap(mapper.function.distance))(poses, jax.jit(mapper)(poses))
     # Another machine or version rounds differently, and then a few poses get the second of two nearest candidates.
     assert float(distance.mean()) == pytest.approx(mapper.report["mean_distance"]["held_out"], rel=1e-3)
@@ -71,53 +69,6 @@ def test_a_policy_reaches_its_recorded_distance(name):
     distance = np.asarray(rollouts.distance)[: held_out.count].mean()
     assert float(distance) == pytest.approx(recorded, rel=1e-3)
     assert recorded < 0.5 * policy.report["hold_distance"]["held_out"]
-
-
-@pytest.fixture(scope="module")
-def any_arm():
-    return mimic.load("any_arm", "pose_mapper")
-
-
-def test_the_mapper_to_any_arm_says_where_it_comes_from(any_arm):
-    report = any_arm.report
-    assert len(report["source"]["commit"]) == 40 and report["training_poses"] > 2e7
-    command = "python -m mimic.train env=any_arm trainer=pose_mapper trainer.preset=any_arm env.arms.expert=drawn"
-    assert report["source"]["command"] == command and any_arm.model.takes_any_expert
-    assert report["hardware"]["device"] and {"python", "jax", "numpy"} <= set(report["versions"])
-    assert any_arm.env.arms.evaluated == [] and "ur5e" in report["arms"]
-
-
-@pytest.mark.slow
-def test_the_mapper_to_any_arm_reaches_its_recorded_distance_on_unseen_locks(any_arm):
-    arms = {name: arm for name, arm in report_arms(any_arm.env)[UNSEEN].items() if name.startswith("locked")}
-    config = TrainConfig(any_arm.env, PoseMapperConfig(preset="any_arm")).resolve()
-    poses = PoseMapperTrainer(config).pairs["arms"].expert_qpos[0]
-    pair = any_arm.model.pair
-    distances = jax.jit(jax.vmap(lambda pose, arm, qpos: pair(arm).target(pose).distance(qpos), (0, None, 0)))
-    recorded = {name: any_arm.report["arms"][name] for name in arms}
-    assert len(arms) == 8 and not any(row["seen"] for row in recorded.values())
-    for name, arm in arms.items():
-        arrays = any_arm.arrays(arm)
-        distance = float(distances(poses, arrays, any_arm(poses[:, :7], arrays)).mean())
-        # Where two proposals are equally near, another machine may take the other one.
-        assert distance == pytest.approx(recorded[name]["mean_distance"], rel=2e-3)
-    # None of these arms was in the training: at most 0.2 % of the way from the optimum to a random pose.
-    quality, guesses = ([row[key] for row in recorded.values()] for key in ("quality", "quality_random_guesses"))
-    assert max(quality) < 0.002 and np.mean(quality) < np.mean(guesses)
-
-
-@pytest.mark.slow
-def test_the_mapper_to_any_arm_is_near_the_optimum_of_three_locked_joints(any_arm):
-    lower, upper = np.asarray(any_arm.expert.joint_range).T
-    poses = np.random.default_rng(0).uniform(lower, upper, (64, 7)).astype(np.float32)
-    mapper = any_arm.to("panda4dof")  # training has locked two joints at most
-    distance = jax.jit(jax.vmap(mapper.distance))
-    mapped = any_arm(poses, "panda4dof")
-    metric = mimic.env_config("panda4dof").metric.build(any_arm.expert, mapper.learner)
-    optimum = mimic.imitate_pose(any_arm.expert, mapper.learner, poses, **metric.arguments).qpos
-    difference = np.asarray(distance(poses, mapped) - distance(poses, optimum))
-    assert mapped.shape == (64, 4)
-    assert -0.01 < difference.mean() < 0.02  # a random pose is 1 farther
 
 
 def test_a_batch_is_the_same_as_its_samples():
