@@ -2,11 +2,10 @@
 
 jax2onnx is given what JAX traced of a function, so that it sees JAX's primitives alone, and not the functions of
 `jax.numpy` and flax, which it would replace by its own while it traces. Primitives that it lacks, or converts wrongly
-where the batch size is not known, are composed of others first: see `_composed`.
+where the batch size is not known, are composed of others first: see `_COMPOSED`.
 """
 
 import contextlib
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -100,7 +99,7 @@ def _check(
 
 
 def _run(jaxpr: Any, consts: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
-    """Runs a traced function without functions in it, and with `_composed` operations."""
+    """Runs a traced function without functions in it, and with `_COMPOSED` operations."""
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *inputs], strict=True))
 
     def value(variable: Any) -> Any:
@@ -119,9 +118,6 @@ def _apply(equation: Any, arguments: list[Any]) -> Sequence[Any]:
     primitive, params = equation.primitive, equation.params
     if primitive.name in _COMPOSED:
         return _COMPOSED[primitive.name](arguments, params, [variable.aval for variable in equation.outvars])
-    if primitive.name == "cond" and params.get("branches_platforms"):  # a function with another form on TPUs
-        default = params["branches"][params["branches_platforms"].index(None)]
-        return _run(default.jaxpr, default.consts, arguments[1:])
     inner = params.get("jaxpr", params.get("call_jaxpr"))
     if inner is not None:
         return _run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", []), arguments)
@@ -134,35 +130,6 @@ def _stack(arguments: list[Any], params: Mapping[str, Any], results: Sequence[An
     return [lax.concatenate([lax.expand_dims(value, [axis]) for value in arguments], axis)]
 
 
-def _tile(arguments: list[Any], params: Mapping[str, Any], results: Sequence[Any]) -> list[Any]:
-    (values,) = arguments
-    for axis, count in enumerate(params["reps"]):
-        values = lax.concatenate([values] * count, axis) if count > 1 else values
-    return [values]
-
-
-def _unstack(arguments: list[Any], params: Mapping[str, Any], results: Sequence[Any]) -> list[Any]:
-    return [lax.index_in_dim(arguments[0], i, params["axis"], keepdims=False) for i in range(len(results))]
-
-
-def _pad(arguments: list[Any], params: Mapping[str, Any], results: Sequence[Any]) -> list[Any]:
-    values, filling = arguments
-    for axis, (low, high, inner) in enumerate(params["padding_config"]):
-        if inner or min(low, high) < 0:
-            raise NotImplementedError(f"onnx: expected padding outside only, got {params['padding_config']}")
-        shapes = [(*values.shape[:axis], size, *values.shape[axis + 1 :]) for size in (low, high)]
-        before, after = (jnp.broadcast_to(filling, shape) for shape in shapes)
-        parts = [part for part in (before, values, after) if part.shape[axis]]
-        values = lax.concatenate(parts, axis) if len(parts) > 1 else values
-    return [values]
-
-
-def _clamp(arguments: list[Any], params: Mapping[str, Any], results: Sequence[Any]) -> list[Any]:
-    low, values, high = arguments
-    low, high = (jnp.broadcast_to(bound, values.shape) for bound in (low, high))
-    return [lax.min(lax.max(values, low), high)]
-
-
 def _select(arguments: list[Any], params: Mapping[str, Any], results: Sequence[Any]) -> list[Any]:
     """Runtimes have no choice between truth values."""
     condition, if_false, if_true = arguments
@@ -172,58 +139,22 @@ def _select(arguments: list[Any], params: Mapping[str, Any], results: Sequence[A
 
 
 def _dynamic_slice(arguments: list[Any], params: Mapping[str, Any], results: Sequence[Any]) -> list[Any]:
+    """A row at a position along an axis: a product with ones and zeros."""
     values, *starts = arguments
     sizes = params["slice_sizes"]
     axes = [axis for axis, size in enumerate(sizes) if size != values.shape[axis]]
     if [sizes[axis] for axis in axes] != [1]:
         raise NotImplementedError(f"onnx: expected one row of {values.shape}, got {sizes}")
-    return [jnp.moveaxis(_rows(values, axes, jnp.reshape(starts[axes[0]], (1,))), 0, axes[0])]
+    (axis,) = axes
+    rows = jnp.moveaxis(values, axis, 0)
+    is_at = (jnp.reshape(starts[axis], (1, 1)) == np.arange(len(rows))).astype(values.dtype)
+    row = jnp.matmul(is_at, rows.reshape(len(rows), -1), precision="highest")
+    return [jnp.moveaxis(row.reshape(1, *rows.shape[1:]), 0, axis)]
 
 
-def _gather(arguments: list[Any], params: Mapping[str, Any], results: Sequence[Any]) -> list[Any]:
-    values, indices = arguments
-    numbers, (result,) = params["dimension_numbers"], results
-    axes = list(numbers.start_index_map)
-    if tuple(sorted(axes)) != numbers.collapsed_slice_dims or indices.ndim != 2:
-        raise NotImplementedError(f"onnx: expected entries at a vector of positions, got {numbers}")
-    sizes = [values.shape[axis] for axis in axes]
-    strides = [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
-    (axis,) = set(range(len(result.shape))) - set(numbers.offset_dims)
-    return [jnp.moveaxis(_rows(values, axes, (indices * np.array(strides, np.int32)).sum(axis=-1)), 0, axis)]
-
-
-def _rows(values: Any, axes: Sequence[int], positions: Any) -> Any:
-    """The entries at positions along some axes, counted in the order of their axes: a product with ones and zeros."""
-    if values.dtype == bool:
-        return _rows(values.astype(jnp.float32), axes, positions) > 0.5
-    first = jnp.moveaxis(values, axes, range(len(axes)))
-    count, rest = math.prod(first.shape[: len(axes)]), first.shape[len(axes) :]
-    is_at = (jnp.asarray(positions)[:, None] == np.arange(count)).astype(values.dtype)
-    return jnp.matmul(is_at, first.reshape(count, -1), precision="highest").reshape(len(positions), *rest)
-
-
-def _scan(arguments: list[Any], params: Mapping[str, Any], results: Sequence[Any]) -> list[Any]:
-    body, first = params["jaxpr"], len(arguments) - len(results)
-    of_step = [variable.aval.shape for variable in (*body.jaxpr.invars, *body.jaxpr.outvars)]
-    if of_step != [value.shape for value in (*map(jnp.asarray, arguments), *results)]:
-        raise NotImplementedError("onnx: expected a loop without values for each step")
-    carried = arguments[first:]
-    for _ in range(params["length"]):
-        carried = _run(body.jaxpr, body.consts, [*arguments[:first], *carried])
-    return carried
-
-
-# jax2onnx 0.13 has no stack, tile, unstack and platform_index. It converts the others wrongly, or not at all, where the
-# batch size is not known; a loop of many operations, always.
+# jax2onnx 0.13 has no stack, and converts the others wrongly where the batch size is not known.
 _COMPOSED: dict[str, Callable[[list[Any], Mapping[str, Any], Sequence[Any]], Sequence[Any]]] = {
-    "clamp": _clamp,
     "dynamic_slice": _dynamic_slice,
-    "gather": _gather,
-    "pad": _pad,
-    "platform_index": lambda arguments, params, results: [np.int32(0)],
-    "scan": _scan,
     "select_n": _select,
     "stack": _stack,
-    "tile": _tile,
-    "unstack": _unstack,
 }
