@@ -22,7 +22,7 @@ HIGHEST = {
     **dict.fromkeys(
         ("bound", "costs", "exact_hands", "pose", "similarity", "teleoperation", "transfer"), "retargeting"
     ),
-    **dict.fromkeys(("any_arm_kernel", "physics"), "envs"),
+    "physics": "envs",
 }
 
 
