@@ -14,7 +14,6 @@ SIMILARITY_HEADERS = {  # of tables and pictures; positions in chain lengths
 }
 SPLIT_NAMES = {"train": "training", "held_out": "held out"}
 SIMILARITY_NAMES = {  # display names that differ from their keys
-    "random_guesses": "random initial guesses",
     "nearest_poses": "nearest poses (metric)",
     "copy_joints": "copying shared joints",
     "hand_ik": "IK of the scaled hand",

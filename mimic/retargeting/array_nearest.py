@@ -22,6 +22,7 @@ from mimic.physics.dynamics import solve
 
 _MIN_DISTANCE = 0.02  # chain lengths; the curvature of a pair's translation is not above the inverse of it
 _DAMPING = 1e-3  # of the Hessian, relative to the mean of its diagonal
+_MAX_STEP = 0.5  # rad, of a joint in a step
 
 
 class Jacobians(NamedTuple):
@@ -151,7 +152,6 @@ def nearest_pose(
     expert: LinkStates,
     qpos: Float[Array, " joints"],
     steps: int,
-    max_step: Float[Array, " joints"] | float = 0.5,
     hand_rotation: float = 0.0,
 ) -> NearestPose:
     """A local minimum near a pose, within the joints' ranges.
@@ -163,7 +163,6 @@ def nearest_pose(
       expert: link states of the expert.
       qpos: pose to start from [rad].
       steps: Newton steps.
-      max_step: largest change of a joint in a step [rad].
       hand_rotation: weight of the hand's rotation.
     """
     lower, upper = arm.angle_limits
@@ -173,7 +172,7 @@ def nearest_pose(
         near = pose_quadratic(arm, weights, matrix, expert, qpos, hand_rotation)
         step = solve_free(near.hessian, -near.gradient, arm.is_free)
         velocity = solve_free(near.hessian, -near.rate, arm.is_free)
-        after = jnp.clip(qpos + jnp.clip(step, -max_step, max_step), lower, upper)
+        after = jnp.clip(qpos + jnp.clip(step, -_MAX_STEP, _MAX_STEP), lower, upper)
         return NearestPose(after, velocity, jnp.diagonal(near.hessian)), None
 
     start = NearestPose(qpos, jnp.zeros_like(qpos), jnp.ones_like(qpos))

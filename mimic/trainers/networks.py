@@ -1,4 +1,4 @@
-"""Networks over the parts of an arm: each joint or link is a token, and attention lets them know of each other."""
+"""A network over the joints of an arm: each is a token, and attention lets them know of each other."""
 
 import jax.numpy as jnp
 import numpy as np
