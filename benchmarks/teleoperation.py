@@ -1,6 +1,6 @@
 """Live teleoperation: followers of another build within their limits, whatever the leader sends.
 
-    python -m benchmarks.teleoperation --data FOLDER --robots FOLDER [--parts episodes sweeps times] [--out FILE]
+    python -m benchmarks.teleoperation --data FOLDER --robots FOLDER [--parts PART ...] [--out FILE]
 
 FOLDER of `--data` has arms/ and teleop/so101_to_piper, that of `--robots` the arms of robosuite; `--clip` is a captured
 person. Episodes: the recorded leader (SO-101) drives a Piper, at the recorded rate and resampled to 100 Hz. The
@@ -9,8 +9,9 @@ within 5 % of that of `imitate_pose`, which has no limits of speed. Sweeps: a le
 ranges, while 30 % of the samples are lost, stall for 2 s, jump, are not finite, or have times that run backwards.
 Limits are checked by differences of the commands, and `clearance_mm` is the smallest distance of capsules around the
 follower's links, where its model has shapes; `recovery` is the time from the first good sample after a fault to
-the first command that follows samples again. Times: of one step, beside a fixed loop of NumPy on the same core, ssik's
-Tracker and mink.
+the first command that follows samples again. Postures: a recorded Panda lifts a cube, and arms with seven joints follow
+from a base of `find_base`; ssik's Tracker and mink start in the same posture. Times: of one step, beside a fixed loop
+of NumPy on the same core, ssik's Tracker and mink.
 """
 
 import argparse
@@ -26,7 +27,7 @@ import numpy as np
 import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
-from benchmarks.exact_hands import SPEEDS, as_numbers, hand_matrices, homogeneous, joint_motions
+from benchmarks.exact_hands import SPEEDS, as_numbers, demonstrations, hand_matrices, homogeneous, joint_motions
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.control.clearance import clearance
@@ -42,6 +43,7 @@ EPISODES = (
     "plane_deg:.1f"
 )
 SWEEPS = "pair steps not_finite beyond_mrad:.6f of_limits:.4f recovery_s:.2f holding:.1% clearance_mm:.1f"
+POSTURES = "follower method position_mm_p50:.2f position_mm_p95:.2f hand_direction_deg:.2f elbow:.3f plane_deg:.1f"
 TIMES = "method p50_ms:.3f p99_ms:.3f p999_ms:.3f core_us_p50:.1f core_us_p99:.1f"
 # rad/s (data sheets); Piper's model states 0 for its first joint, those of robosuite nothing.
 SPEED = {
@@ -49,10 +51,14 @@ SPEED = {
     "panda": [2.175] * 4 + [2.61] * 3,
     "so101": [4.7] * 5,
     "ur5e": SPEEDS["ur5e"],
+    "iiwa": SPEEDS["iiwa14"],
+    "kinova3": SPEEDS["gen3"],
+    "jaco": SPEEDS["jaco"],
 }
 BASE = [0.0, 0.115, 0.03, -0.535]  # of the Piper in the SO-101's base frame, from `find_base`, rounded
 PAIRS = ("panda-ur5e", "ur5e-panda", "so101-panda", "panda-so101", "person-panda")
 FAULTS = ("lost", "stalled", "jumped", "displaced", "not finite", "backwards")
+REDUNDANT = ("iiwa", "kinova3", "jaco")  # followers of a Panda
 _RATE, _LOST = 100.0, 0.3  # Hz; fraction of samples that are lost
 _TIMED = 3  # episodes
 
@@ -61,9 +67,10 @@ def config(name: str, options: argparse.Namespace) -> ArmConfig:
     files = {
         "so101": options.data / "arms/so101/so101_new_calib.urdf",
         "piper": options.data / "arms/piper.urdf",
-        "ur5e": options.robots / "ur5e/robot.xml",
     }
-    return ArmConfig() if name == "panda" else ArmConfig(model=str(files[name]))
+    return (
+        ArmConfig() if name == "panda" else ArmConfig(model=str(files.get(name, options.robots / name / "robot.xml")))
+    )
 
 
 def arm(name: str, options: argparse.Namespace) -> Embodiment:
@@ -304,6 +311,23 @@ def core_seconds(count: int = 2000) -> np.ndarray:
     return np.array(seconds)
 
 
+def postures(options: argparse.Namespace) -> Iterator[Row]:
+    ((_, recorded, dt),) = demonstrations(options.data / "robosuite_demos", ("lift",))
+    leader, qpos = arm("panda", options), resampled(recorded.astype(float), 1 / dt)
+    for name in REDUNDANT:
+        follower, speed = arm(name, options), SPEED[name]
+        metric = MetricConfig().build(leader, follower)
+        base = mimic.find_base(leader, follower, [recorded], **metric.arguments, largest_jump=np.multiply(speed, dt))
+        targets = np.linalg.inv(homogeneous(*placement(base))) @ hand_matrices(leader, qpos)
+        operator = mimic.Teleoperator(leader, follower, base=base, velocity=speed, rate=_RATE)
+        own = {"mimic": driven(operator, qpos)[0]}
+        own["mink"], _ = tracked_by_mink(follower, targets, own["mimic"][0], speed)
+        own["ssik's Tracker"], _ = tracked_by_ssik(follower, targets, own["mimic"][0], speed)
+        for method, path in own.items():
+            row = hand_errors(leader, follower, base, qpos, path) | resemblance(leader, follower, base, qpos, path)
+            yield as_numbers({"follower": name, "method": method, "steps": len(path), **row})
+
+
 def times(options: argparse.Namespace) -> Iterator[Row]:
     leader, follower = arm("so101", options), arm("piper", options)
     qpos = np.concatenate([resampled(path, 15.0) for path in recordings(leader, "deg", options)[:_TIMED]])
@@ -311,8 +335,8 @@ def times(options: argparse.Namespace) -> Iterator[Row]:
     operator = mimic.Teleoperator(leader, follower, base=BASE, velocity=SPEED["piper"], rate=_RATE)
     methods: dict[str, Callable[[], tuple[np.ndarray, np.ndarray]]] = {
         "mimic": lambda: driven(operator, qpos)[:2],
-        "mink": lambda: tracked_by_mink(follower, targets, operator.step(None).qpos),
-        "ssik's Tracker": lambda: tracked_by_ssik(follower, targets, operator.step(None).qpos),
+        "mink": lambda: tracked_by_mink(follower, targets, operator.step(None).qpos, SPEED["piper"]),
+        "ssik's Tracker": lambda: tracked_by_ssik(follower, targets, operator.step(None).qpos, SPEED["piper"]),
     }
     for method, run in methods.items():
         core = 1e6 * core_seconds()
@@ -324,13 +348,15 @@ def times(options: argparse.Namespace) -> Iterator[Row]:
         yield as_numbers(row)
 
 
-def tracked_by_ssik(follower: Embodiment, targets: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def tracked_by_ssik(
+    follower: Embodiment, targets: np.ndarray, start: np.ndarray, speed: list[float]
+) -> tuple[np.ndarray, np.ndarray]:
     import ssik
 
     points = np.concatenate([np.zeros((1, 3)), follower.joint_anchor, follower.hand_position])
     manipulator = ssik.Manipulator.from_axes(follower.joint_axis, np.diff(points, axis=0), limits=follower.joint_range)
     back = homogeneous(follower.hand_rotation[0].T, np.zeros(3))
-    tracker, path, seconds = ssik.Tracker(manipulator, start, max_joint_speed=SPEED["piper"]), [], []
+    tracker, path, seconds = ssik.Tracker(manipulator, start, max_joint_speed=speed), [], []
     for tick, target in enumerate(targets):
         began = time.perf_counter()
         step = tracker.update(target @ back, tick / _RATE)
@@ -339,7 +365,9 @@ def tracked_by_ssik(follower: Embodiment, targets: np.ndarray, start: np.ndarray
     return np.array(path), np.array(seconds)
 
 
-def tracked_by_mink(follower: Embodiment, targets: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def tracked_by_mink(
+    follower: Embodiment, targets: np.ndarray, start: np.ndarray, speed: list[float]
+) -> tuple[np.ndarray, np.ndarray]:
     """One step of mink's inverse kinematics for each target, within the limits of position and velocity."""
     import mink
 
@@ -347,7 +375,7 @@ def tracked_by_mink(follower: Embodiment, targets: np.ndarray, start: np.ndarray
 
     model = mink_model(follower)
     configuration = mink.Configuration(model, start)
-    speeds = dict(zip(follower.joint_names, SPEED["piper"], strict=True))
+    speeds = dict(zip(follower.joint_names, speed, strict=True))
     limits = [mink.ConfigurationLimit(model), mink.VelocityLimit(model, speeds)]
     task, path, seconds = mink.FrameTask("hand", "site", 1.0, 1.0, lm_damping=1e-3), [], []
     for target in targets:
@@ -362,22 +390,28 @@ def tracked_by_mink(follower: Embodiment, targets: np.ndarray, start: np.ndarray
 
 def main() -> None:
     parser = make_parser(
-        "teleoperation", __doc__, parts=("episodes", "sweeps", "times"), pairs=PAIRS, steps=20000, episodes=55
+        "teleoperation",
+        __doc__,
+        parts=("episodes", "sweeps", "postures", "times"),
+        pairs=PAIRS,
+        steps=20000,
+        episodes=55,
     )
     for name in ("data", "robots", "clip"):
         parser.add_argument(f"--{name}", type=Path)
     options = parser.parse_args()
-    content: dict[str, list[Row]] = {"episodes": [], "sweeps": [], "times": []}
+    content: dict[str, list[Row]] = {"episodes": [], "sweeps": [], "postures": [], "times": []}
     makers = {
         "episodes": lambda: episodes(options),
         "sweeps": lambda: (sweep(name, options) for name in options.pairs),
+        "postures": lambda: postures(options),
         "times": lambda: times(options),
     }
     for part in options.parts:
         for row in makers[part]():
             content[part].append(row)
             write_results(options, **content)
-    for part, columns in (("episodes", EPISODES), ("sweeps", SWEEPS), ("times", TIMES)):
+    for part, columns in (("episodes", EPISODES), ("sweeps", SWEEPS), ("postures", POSTURES), ("times", TIMES)):
         print_table(content[part], columns, part)
 
 
