@@ -1,6 +1,8 @@
 """The pages' tables of any arm, robots and motion capture: rows of cells, the header first."""
 
 import statistics
+from collections.abc import Callable
+from typing import Any
 
 from benchmarks.common.cells import MEASURES, Cells, Results, one, percent, span, where
 
@@ -222,3 +224,31 @@ def transferred_teleoperation(results: Results) -> list[Cells]:
         places = f"{row['position_mm_p50']:.1f} / {row['position_mm_p95']:.1f}"
         rows.append((row["method"], f"{row['hand_direction_deg']:.1f}", places))
     return rows
+
+
+def ticks(teleoperation: Results) -> list[Cells]:
+    """Times, errors and limits of live followers by method."""
+    times = teleoperation["times"]
+    percentiles = {"p50_ms": "p50", "p99_ms": "p99", "p999_ms": "p99.9"}
+    cells: dict[str, Callable[[Any], str]] = {
+        f"tick, {' / '.join(percentiles.values())} [ms]": lambda row: " / ".join(
+            f"{row[key]:.2f}" for key in percentiles
+        ),
+        "hand, p50 / p95 [mm]": lambda row: f"{row['position_mm_p50']:.1f} / {row['position_mm_p95']:.0f}",
+        "acceleration or jerk over its limit": lambda row: f"{row['of_limits']:.1f}",
+        "plane of shoulder, elbow and wrist [deg]": lambda row: f"{row['plane_deg']:.1f}",
+    }
+    rows = [(name, *(cell(row) for row in times)) for name, cell in cells.items()]
+    return [("SO-101 to Piper", *(row["method"] for row in times)), *rows]
+
+
+def live_postures(teleoperation: Results) -> list[Cells]:
+    """Hands and postures of arms with seven joints that follow a Panda, by method."""
+    found = {(row["follower"], row["method"]): row for row in teleoperation["postures"]}
+    followers, methods = (dict.fromkeys(key[index] for key in found) for index in (0, 1))
+    cells = {
+        (follower, method): f"{row['position_mm_p95']:.1f}; {row['elbow']:.3f}; {row['plane_deg']:.1f}"
+        for (follower, method), row in found.items()
+    }
+    rows = [(follower, *(cells[follower, method] for method in methods)) for follower in followers]
+    return [("Panda to", *methods), *rows]
