@@ -151,8 +151,8 @@ class _Ghost:
 
     def _move_to(self, frame: Frame) -> None:
         arms = (self._match.expert, frame.expert), (self._match.learner, frame.learner)
-        poses = [np.array([angles[name] for name in arm.joint_names]) for arm, angles in arms]
-        capsules = self._match.ghost(*poses)
+        expert, learner = (np.array([angles[name] for name in arm.joint_names]) for arm, angles in arms)
+        capsules = self._match.ghost(expert, learner)
         for mesh, capsule in zip(self._links, capsules, strict=False):
             mesh.position, mesh.wxyz = capsule.start, along_z(capsule.end - capsule.start)
         lines = [(capsule.start, capsule.end) for capsule in capsules[self._num_links :]]
