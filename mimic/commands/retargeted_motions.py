@@ -80,22 +80,35 @@ def read_motions(folder: Path) -> RetargetedMotions:
     Raises:
       ValueError: there are none, or they are damaged.
     """
+    path = folder / MOTIONS
+    if not path.is_file():
+        raise ValueError(f"retargeted: expected a folder that mimic.retarget source=DATA wrote, got no {str(path)!r}")
     try:
-        arrays = read_arrays(folder / MOTIONS, _NAMES)
+        arrays = read_arrays(path, _NAMES)
         joints = {arm: tuple(map(str, arrays[f"{arm}_joints"])) for arm in _ARMS}
         qpos = {arm: np.asarray(arrays[f"{arm}_qpos"], float) for arm in _ARMS}
         episodes, points = tuple(map(str, arrays["episodes"])), np.asarray(arrays["split_points"], int)
-        time, base = np.asarray(arrays["time"], float), np.asarray(arrays["base"], float).tolist()
-        shapes = [(len(time), len(joints[arm])) for arm in _ARMS]
-        assert shapes == [angles.shape for angles in qpos.values()]
-        assert len(base) == 4
-        assert len(points) == len(episodes) + 1
-        assert points[0] == 0
-        assert points[-1] == len(time)
-        assert (np.diff(points) > 0).all()
-    except (ValueError, KeyError, AssertionError) as error:
-        name = str(folder / MOTIONS)
-        raise ValueError(
-            f"retargeted: expected a folder that mimic.retarget source=DATA wrote, got no {name!r}"
-        ) from error
-    return RetargetedMotions(episodes, joints, qpos, time, points, base)
+        time, base = np.asarray(arrays["time"], float), np.asarray(arrays["base"], float)
+        if not _are_motions(joints, qpos, episodes, points, time, base):
+            raise ValueError("shapes, times or values that are no motions")
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"retargeted: {str(path)!r} is damaged: {error}") from error
+    return RetargetedMotions(episodes, joints, qpos, time, points, base.tolist())
+
+
+def _are_motions(
+    joints: Mapping[str, tuple[str, ...]],
+    qpos: Mapping[str, np.ndarray],
+    episodes: tuple[str, ...],
+    points: np.ndarray,
+    time: np.ndarray,
+    base: np.ndarray,
+) -> bool:
+    """Whether shapes fit, values are finite, and times increase within each episode."""
+    shapes_fit = all(qpos[arm].shape == (len(time), len(joints[arm])) for arm in _ARMS)
+    shapes_fit &= time.ndim == 1 and base.shape == (4,) and points.shape == (len(episodes) + 1,)
+    if not shapes_fit or points[0] != 0 or points[-1] != len(time) or (np.diff(points) <= 0).any():
+        return False
+    ends = points[1:-1] - 1  # from which to the next there is another episode
+    steps = np.delete(np.diff(time), ends)
+    return all(np.isfinite(array).all() for array in (*qpos.values(), time, base)) and bool((steps > 0).all())

@@ -74,9 +74,10 @@ def past_failing_times(
       possible: at which times a posture with exact hands is known; there is no search past others. Default None: all.
       starts: postures with which a way may begin at the first time; that of the path alone by default.
     """
-    arm = _Arm(learner, chosen, jump * _MARGIN, *motion_limits(learner), continuous_joints(learner))
+    jump = _MARGIN * np.minimum(jump, np.pi)  # finite
+    arm = _Arm(learner, chosen, jump, *motion_limits(learner), continuous_joints(learner))
     path, exact, start = np.array(path, float), np.array(exact), 0
-    starts = np.concatenate([path[:1], np.empty((0, len(jump))) if starts is None else starts])
+    starts = np.concatenate([path[:1][exact[:1]], np.empty((0, len(jump))) if starts is None else starts])
     starts = starts[_within(arm, starts)]
     possible = np.ones(len(path), bool) if possible is None else possible
     while len(failing := start + np.flatnonzero(~exact[start:])):

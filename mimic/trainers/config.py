@@ -217,8 +217,7 @@ class PoseMapperConfig(TrainerConfig):
 
     Attributes:
       name: "pose_mapper".
-      preset: "large" or "paper" for one learner, "any_arm" or "any_arm_cpu" where the learner is drawn, or "auto":
-        "large", or of the latter two that of JAX's backend.
+      preset: "large", which "auto" is too, or "paper".
       inputs: "angles" of the expert (paper), or its "link_states": positions and directions.
       outputs: "tanh", scaled to the joint's range (paper), or "circle": a point on the unit circle for joints whose
         range is a full rotation.

@@ -37,19 +37,37 @@ def test_an_episode_comes_back(folder):
     np.testing.assert_array_equal(learner_qpos, motions(4)["second"].qpos)
 
 
-@pytest.mark.parametrize("damage", ["missing", "truncated", "other arrays"])
-def test_what_is_no_such_folder_is_one_line(folder, damage):
-    content = (folder / MOTIONS).read_bytes()
-    (folder / MOTIONS).unlink()
-    if damage == "truncated":
-        (folder / MOTIONS).write_bytes(content[:-100])
-    if damage == "other arrays":
-        np.savez(folder / MOTIONS, time=np.zeros(3))
-    with pytest.raises(
-        ValueError, match="retargeted: expected a folder that mimic.retarget source=DATA wrote"
-    ) as error:
+def test_what_is_no_such_folder_is_one_line(tmp_path):
+    with pytest.raises(ValueError, match="retargeted: expected a folder that mimic.retarget source=DATA wrote"):
+        read_motions(tmp_path)
+
+
+def test_a_truncated_file_is_one_line(folder):
+    (folder / MOTIONS).write_bytes((folder / MOTIONS).read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"retargeted: '.*' is damaged: [^\n]*$"):
         read_motions(folder)
-    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"split_points": np.array(3)},
+        {"split_points": np.array([0, 4, 10])},
+        {"episodes": np.array("first")},
+        {"time": np.full(11, np.nan)},
+        {"time": np.arange(11, 0, -1.0)},
+        {"base": np.zeros(3)},
+        {"expert_qpos": np.full((11, 7), np.inf)},
+        {"learner_joints": np.array(["a", "b"])},
+    ],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_a_damaged_array_is_one_line(folder, changes):
+    with np.load(folder / MOTIONS) as file:
+        arrays = dict(file)
+    np.savez(folder / MOTIONS, **arrays | changes)
+    with pytest.raises(ValueError, match=r"retargeted: '.*' is damaged: [^\n]*$"):
+        read_motions(folder)
 
 
 @pytest.mark.parametrize(

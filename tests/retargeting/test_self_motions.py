@@ -50,3 +50,19 @@ def test_a_way_may_begin_with_other_postures_at_the_first_time(motion):
     np.testing.assert_array_equal(past_failing_times(panda(), HAND, targets, path, exact, JUMP)[:5], path[:5])
     found = past_failing_times(panda(), HAND, targets, path, exact, JUMP, starts=motion[:1])
     assert errors(found, targets).max() < 1e-4
+
+
+def test_a_way_does_not_begin_with_a_posture_that_is_not_exact(motion):
+    targets, path, exact = hand_poses(panda(), motion), motion.copy(), np.arange(TIMES) > 0
+    path[0] += JUMP / 4
+    found = past_failing_times(panda(), HAND, targets, path, exact, JUMP, starts=motion[:1])
+    assert errors(found, targets).max() < 1e-4
+    alone = past_failing_times(panda(), HAND, targets[:1], path[:1], exact[:1], JUMP, starts=motion[:1])
+    assert errors(alone, targets[:1]).max() < 1e-4
+
+
+def test_joints_without_a_limit_of_speed_are_searched(motion):
+    targets, path, exact = hand_poses(panda(), motion), motion.copy(), np.ones(TIMES, bool)
+    path[FAILING], exact[FAILING] = motion[FAILING.start - 1], False
+    found = past_failing_times(panda(), HAND, targets, path, exact, np.full(7, np.inf))
+    assert errors(found, targets).max() < 1e-4
