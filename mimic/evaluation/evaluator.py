@@ -21,7 +21,14 @@ from mimic.envs.imitation import ImitationEnv
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.evaluation.labels import ALL_KINDS, SPLITS
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
-from mimic.evaluation.references import CONTROLLER, Motions, References, references_of_arms, references_of_one_arm
+from mimic.evaluation.references import (
+    CONTROLLER,
+    Motions,
+    References,
+    baseline_motions,
+    references_of_arms,
+    references_of_one_arm,
+)
 from mimic.evaluation.rollout_metrics import (
     WORST,
     Table,
@@ -110,6 +117,7 @@ class Evaluator:
             ends = 0, training.count, training.count + held_out.count
             self.groups = [Group(split, env.learner.name, slice(*ends[i : i + 2])) for i, split in enumerate(SPLITS)]
             self._references = Background(lambda: references_of_one_arm(self.env))
+            self._baselines = Background(lambda: baseline_motions(self.env))
             return
         assert isinstance(env, AnyArmEnv) and controller is not None
         names = [(split, name) for split, key in zip(SPLITS, (SEEN, UNSEEN), strict=True) for name in arms[key]]
@@ -127,6 +135,7 @@ class Evaluator:
             return references_of_arms(of_many, stacked, rollouts.qpos, rollouts.distance)
 
         self._references = Background(references)
+        self._baselines = Background(lambda: {})  # they are among the references
 
     def on_mjx(self) -> "Evaluator":
         """An evaluator of rollouts on MJX, with the same bound and the same baselines."""
@@ -135,8 +144,12 @@ class Evaluator:
         return evaluator
 
     def prepare(self) -> None:
-        """Starts to compute `lower_bound`, `hold_distance` and the baselines in the background."""
+        """Starts to compute `lower_bound` and `hold_distance` in the background."""
         self._references.start()
+
+    def prepare_baselines(self) -> None:
+        """Starts to compute the baselines in the background. Most of it is Python, which would delay a compilation."""
+        self._baselines.start()
 
     @property
     def lower_bound(self) -> Float[np.ndarray, "demonstrations time"]:
@@ -226,7 +239,8 @@ class Evaluator:
 
     @functools.cached_property
     def _baseline_similarity(self) -> dict[str, Table]:
-        return {name: self.similarity(qpos) for name, qpos in self._references().motions.items()}
+        motions = {**self._references().motions, **self._baselines()}
+        return {name: self.similarity(qpos) for name, qpos in motions.items()}
 
     def similarity_summary(self, rollouts: Rollouts, controller: str) -> dict[str, dict[str, dict[str, float]]]:
         """Means by split of each measure of similarity, for a controller and for the baselines.

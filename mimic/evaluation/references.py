@@ -31,7 +31,7 @@ class References(NamedTuple):
     Attributes:
       bound: [rows, time] the kinematic bound.
       hold: [rows, time] distance of holding the start pose.
-      motions: the learner's angles [rows, time, joints] [rad] by baseline; see `Evaluator.similarity_summary`.
+      motions: the learner's angles [rows, time, joints] [rad] by name; see `Evaluator.similarity_summary`.
       controller: [rows, time] distance of the zero action of many arms, which is a controller; otherwise None.
     """
 
@@ -55,8 +55,12 @@ def references_of_one_arm(env: ImitationEnv) -> References:
     )
     # If copying the expert's joints gives distance 0 everywhere, the bound needs no optimisation.
     bound, nearest = _lower_bound(env, qpos, qvel) if copied.any() else (copied, copied_qpos)
-    motions = {"nearest_poses": nearest, **baseline_poses(env.expert, env.learner, qpos)}
-    return References(bound, hold, motions)
+    return References(bound, hold, {"nearest_poses": nearest})
+
+
+def baseline_motions(env: ImitationEnv) -> dict[str, Motions]:
+    """The learner's angles of each of `pose_baselines.BASELINES`, in an environment of one learner."""
+    return baseline_poses(env.expert, env.learner, env.demonstrations.qpos[:, 1 : env.config.horizon + 1])
 
 
 def _expert_states(env: ImitationEnv) -> LinkStates:

@@ -22,7 +22,7 @@ from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.ppo import brax_loop, ppo, report_rows
+from mimic.trainers.ppo import ppo, report_rows
 from mimic.trainers.trainer import Metrics, OnEvaluation, Params, Row, Trainer
 
 EVALUATED_DEMONSTRATIONS = 8  # of the held-out ones, by each of many arms: with 29 arms, 232 rollouts and bounds
@@ -144,7 +144,7 @@ class PPOTrainer(Trainer):
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template)
 
     def prepare_evaluation(self) -> None:
-        """Starts to compile the evaluation, and to compute the bound and the baselines, in this order."""
+        """Starts to compile the evaluation, and to compute the bound, in this order."""
         self._rollouts.start()
         if self._has_many_arms:
             self._controller_rollouts.start()
@@ -157,12 +157,12 @@ class PPOTrainer(Trainer):
 
         def evaluated(step: int, params: Params, metrics: Mapping[str, float]) -> bool:
             stop = on_evaluation(step, params, metrics)
+            self.evaluator.prepare_baselines()  # not earlier: it would delay the functions of the training
             if self._is_cross_checked:
-                self._rollouts_on_mjx.start()  # not earlier: it would delay the functions of the training
+                self._rollouts_on_mjx.start()
             return stop
 
-        train = ppo.train if self.settings.loop == "mimic" else brax_loop.train
-        return train(
+        return self._loop(
             self._env,
             self.settings,
             run_dir,
@@ -172,6 +172,14 @@ class PPOTrainer(Trainer):
             restored=restored,
             on_compiling=self.prepare_evaluation,
         )
+
+    @property
+    def _loop(self) -> Callable[..., tuple[int, Params]]:
+        if self.settings.loop == "mimic":
+            return ppo.train
+        from mimic.trainers.ppo import brax_loop  # takes half a second
+
+        return brax_loop.train
 
     def follow(self, restored: Checkpoint | None) -> None:
         """See `ppo.train`."""
