@@ -23,8 +23,10 @@ _ROTATION, _POSTURE, _DAMPING = 3e-4, 3e-7, 1e-7  # weights of a step; the hand'
 _LEVER = 0.5
 _SMOOTHING = 1e-2  # chain lengths below which a distance of links is a square
 FAR, NEAR = 0.3, 0.03  # chain lengths, the longest pulls on hands: of a search, and of a follower
-_PASSES = 3  # of a step, each without the joints that the last one moved to the edge of the box
+_PASSES = 3  # of a step near walls, each with those that the last one went beyond
 _STIFF, _ON_WALL = 1e3, 1e-7  # of walls, beside 1 of the hand's position; m beyond them
+# Of costs for mju_boxQP, which ends at gradients of 1e-8, a tenth of the posture's; rad of the boxes, which it needs.
+_SCALE, _WIDTH = 1e6, 1e-12
 
 
 class Goal(NamedTuple):
@@ -52,7 +54,7 @@ class ArmRows:
     MuJoCo's kinematics of a model of joints and sites: one call in C for what takes NumPy twenty.
 
     Attributes:
-      links, hands: their numbers.
+      joints, links, hands: their numbers.
       unit: chain length [m].
       knows_roll: whether the rotation of the hands about their z-axes is known.
       anchors, axes: rows of the joints, as slices.
@@ -61,14 +63,14 @@ class ArmRows:
     """
 
     def __init__(self, arm: Embodiment):
-        self.unit, self._joints, self.links = float(arm.chain_length), arm.num_joints, arm.num_links
+        self.unit, self.joints, self.links = float(arm.chain_length), arm.num_joints, arm.num_links
         self.knows_roll, (positions, rotations, hand_joint) = bool(arm.hand_joint), _hands(arm)
         self.hands = len(hand_joint)
         site_joint = [*arm.link_joint, *hand_joint]
         poses = np.concatenate([arm.link_position, positions]), np.concatenate([arm.link_rotation, rotations])
         self._model = _model(arm, site_joint, poses[0], poses[1], self.unit)
         self._data = data = mujoco.MjData(self._model)
-        joints = np.array([self._model.joint(str(joint)).id for joint in range(self._joints)])
+        joints = np.array([self._model.joint(str(joint)).id for joint in range(self.joints)])
         sites = np.array([self._model.site(str(site)).id for site in range(len(site_joint))])
         self._qpos, self._address = data.qpos, self._model.jnt_qposadr[joints]
         self._parts = [x.ravel() for x in (data.xanchor, data.xaxis, data.site_xpos, data.site_xmat)]
@@ -85,7 +87,7 @@ class ArmRows:
         self.moving, self._hand_axes = slice(edges[2], None), edges[-1]
         of_rows = [*arm.link_joint, *arm.link_joint, *hand_joint, *np.repeat(hand_joint, 3)]
         is_point = np.repeat([1.0, 0.0, 1.0, 0.0], [links, links, hands, 3 * hands])
-        moves = [[is_ancestor(arm, joint, row) for row in of_rows] for joint in range(self._joints)]
+        moves = [[is_ancestor(arm, joint, row) for row in of_rows] for joint in range(self.joints)]
         self._moves, self._is_point = np.array(moves, float)[:, :, None], is_point[:, None]
 
     def __call__(self, qpos: Float[np.ndarray, "lanes joints"]) -> Rows:
@@ -104,7 +106,7 @@ class ArmRows:
 
     def jacobian(self, rows: Rows) -> Float[np.ndarray, "lanes joints moving 3"]:
         """Derivatives of the moving rows with respect to the joint angles."""
-        cross = (rows[:, self.axes] @ LEVI_CIVITA).reshape(-1, self._joints, 3, 3)
+        cross = (rows[:, self.axes] @ LEVI_CIVITA).reshape(-1, self.joints, 3, 3)
         return ((rows[:, None, self.moving] - self._is_point * rows[:, self.anchors, None]) @ cross) * self._moves
 
 
@@ -178,9 +180,8 @@ class LivePose:
         factors = np.asarray(metric.factors(leader.hands, follower.hands))[:, : leader.links, : follower.links]
         translation, rotation = (factors[PARTS.index(part)] for part in ("translation", "rotation"))
         self._translation, self._rotation = _POSTURE * translation, _POSTURE * np.pi / 2 * rotation.T
-        from scipy.linalg.lapack import dposv  # half a second to import; np.linalg.solve takes eight times as long
-
-        self._posv: Any = dposv  # of symmetric matrices, which the damping makes positive definite
+        joints = follower.joints
+        self._factor = np.zeros((joints, joints + 7))  # where mju_boxQP works
         self._leader, self._follower, self._pairs, matched = leader, follower, len(pairs), pairs[:, 1]
         self.knows_roll = leader.knows_roll and follower.knows_roll
         # Of the cosine of the rotation, r (1 - cos theta) = r/4 sum |e_k - t_k|^2 over the axes.
@@ -301,25 +302,10 @@ class LivePose:
     def _step_in_box(
         self, hessian: np.ndarray, gradient: np.ndarray, lower: np.ndarray, upper: np.ndarray
     ) -> np.ndarray:
-        """The minimum of a quadratic function in a box, where joints that reach an edge stay there."""
-        joints = hessian.shape[-1]
-        right = -gradient
-        step, free = self._solve(hessian, right), 1.0
-        for _ in range(_PASSES):
-            inside = np.minimum(np.maximum(step, lower), upper)
-            is_inside = inside == step
-            if is_inside.all():
-                break
-            free = free * is_inside  # what is held is at the edge, and stays
-            held = 1.0 - free
-            fixed = held * inside
-            matrix = hessian * (free[:, :, None] * free[:, None])
-            matrix.reshape(-1, joints * joints)[:, :: joints + 1] += held
-            step = self._solve(matrix, free * (right - (hessian @ fixed[..., None])[..., 0]) + fixed)
-        return np.minimum(np.maximum(step, lower), upper)
-
-    def _solve(self, matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
-        solution = np.empty(right.shape)
-        for lane in range(len(right)):
-            solution[lane] = self._posv(matrices[lane], right[lane])[1]
-        return solution
+        """The minimum of a quadratic function in a box."""
+        step, factor, upper = np.zeros_like(gradient), self._factor, np.maximum(upper, lower + _WIDTH)
+        for lane in range(len(gradient)):
+            mujoco.mju_boxQP(
+                step[lane], factor, None, _SCALE * hessian[lane], _SCALE * gradient[lane], lower[lane], upper[lane]
+            )
+        return step

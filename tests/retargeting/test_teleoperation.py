@@ -89,6 +89,20 @@ def test_posture_is_that_of_imitate_pose(arms):
     np.testing.assert_allclose(qpos[cost.argmin()], expected.qpos, atol=2e-3)
 
 
+def test_a_step_is_the_best_in_its_box(arms):
+    """Also where many joints are at an edge: a step that only cuts off what is beyond goes to and fro there."""
+    rng, rows = np.random.default_rng(0), [ArmRows(arm) for arm in arms]
+    pose = LivePose(*rows, matched_hands(*arms), mimic.metric.config.MetricConfig().build(*arms))
+    columns, gradient = rng.normal(size=(200, 3, 6)), 0.03 * rng.normal(size=(200, 6))
+    hessian = columns.swapaxes(1, 2) @ columns + 1e-5 * np.eye(6)  # as of a hand: three directions, and damping
+    lower, upper = -rng.choice([0.0, 0.02], (200, 6)), rng.choice([0.0, 0.02], (200, 6))
+    step = pose._step_in_box(hessian, gradient, lower, upper)
+    slope = (hessian @ step[..., None])[..., 0] + gradient
+    assert np.all((step >= lower) & (step <= upper + 1e-11))  # a box has a width
+    rises, falls = slope > -1e-9, slope < 1e-9  # of double precision
+    assert np.all((rises | (step >= upper)) & (falls | (step <= lower)))
+
+
 @pytest.mark.parametrize("hand", ["exact", "relative"])
 def test_hand_is_reached(arms, hand):
     operator = mimic.Teleoperator(*arms, hand=hand, rate=RATE)
