@@ -49,6 +49,7 @@ from mimic.runs.sweeps.sweeper import FAILED, Outcome, register_sweeper
 from mimic.trainers.config import TrainConfig, trainer_config, trainers
 from mimic.trainers.export.config import ExportConfig
 
+_SWITCH_INTERVAL = 5e-4  # s; with Python's 5 ms, a loop of short numpy calls starves beside threads that compile
 _LONGEST_MESSAGE = 1000  # characters: Hydra repeats the argument
 FIRST_KEY = {"inspect": "learner", "collect": "folder"}  # key of each command's positional argument
 FIRST_KEY_OF_SUFFIX = {  # the same where the argument is a file of another kind
@@ -217,6 +218,7 @@ def process_started() -> float:
 
 def start_backend() -> None:
     """Initialises JAX's backend in a thread while this one imports modules: CUDA takes seconds."""
+    sys.setswitchinterval(_SWITCH_INTERVAL)
     threading.Thread(target=_initialise_backend, name="backend").start()
 
 

@@ -4,10 +4,12 @@ import contextlib
 import csv
 import os
 import socket
+import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, cast
 
 from mimic.base.files import read_text
 from mimic.runs.files import METRICS, write_csv
@@ -23,10 +25,8 @@ class MetricsLog:
     """
 
     def __init__(self, run_dir: Path, first_step: int | None = None):
-        import tensorboardX  # here: half a second, and most commands train nothing
-
         self._path = run_dir / METRICS
-        self._tensorboard = tensorboardX
+        self._tensorboard = _import_tensorboard()
         name = f"events.out.tfevents.{time.time():.0f}.{socket.gethostname()}"
         (run_dir / "tensorboard").mkdir(exist_ok=True)
         # Not by its SummaryWriter, whose thread prints the error of a full disk and goes on without writing.
@@ -73,6 +73,17 @@ class MetricsLog:
         """Closes the file of events; what could not be written is dropped."""
         with contextlib.suppress(OSError):
             self._records.close()
+
+
+def _import_tensorboard() -> Any:
+    """tensorboardX: half a second, and without the four of PyTorch, which it imports wherever that is installed."""
+    with contextlib.ExitStack() as stack:
+        if "torch" not in sys.modules:
+            sys.modules["torch"] = cast(ModuleType, None)  # an ImportError, which tensorboardX expects
+            stack.callback(sys.modules.pop, "torch")
+        import tensorboardX
+
+        return tensorboardX
 
 
 def _read(path: Path) -> tuple[list[str], list[dict[str, str]]]:

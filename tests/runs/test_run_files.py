@@ -2,9 +2,12 @@
 
 import csv
 import json
+import os
 import resource
 import signal
 import struct
+import subprocess
+import sys
 
 import pytest
 import tensorboardX
@@ -32,6 +35,14 @@ def test_metrics_of_another_version_keep_their_columns(tmp_path):
     assert rows[0] == {"step": "1", "old": "0.5", "wall_time_s": "2.0", "new": ""}
     assert rows[2] == {"step": "3", "old": "", "wall_time_s": "4.0", "new": "30.0"}
     assert {path.name for path in tmp_path.iterdir()} == {"metrics.csv", "tensorboard"}
+
+
+def test_a_training_does_not_import_pytorch(tmp_path):
+    """It takes four seconds where it is installed, and nothing needs it."""
+    (tmp_path / "torch.py").write_text("raise RuntimeError('imported')")
+    code = "import sys, mimic.trainers.ppo.trainer as _; from mimic.runs.metrics_log import MetricsLog; "
+    code += f"from pathlib import Path; MetricsLog(Path({str(tmp_path)!r})).close(); assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"PYTHONPATH": str(tmp_path)})
 
 
 def rows_of(run_dir):
