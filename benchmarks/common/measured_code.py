@@ -20,7 +20,8 @@ HIGHEST = {
     **dict.fromkeys(("hands", "models"), "arms"),
     "kernel": "metric",
     **dict.fromkeys(
-        ("bound", "costs", "exact_hands", "pose", "similarity", "teleoperation", "transfer"), "retargeting"
+        ("bound", "costs", "exact_hands", "pose", "similarity", "teleoperation", "transfer", "transfer_throughput"),
+        "retargeting",
     ),
     "physics": "envs",
 }

@@ -1,6 +1,7 @@
 """Data sets of one arm as data sets of another: what `python -m mimic.retarget source=DATA` does."""
 
 import dataclasses
+import itertools
 import json
 import os
 import sys
@@ -18,6 +19,7 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.gripper import GripperRange, gripper_range
+from mimic.base import compat
 from mimic.base.config import new_folder
 from mimic.base.files import write_atomically
 from mimic.commands.certificate_plot import plot_certificates
@@ -29,14 +31,15 @@ from mimic.motions.grippers import other_gripper
 from mimic.motions.rewriting import DataSet, read_data_set, write_data_set
 from mimic.retargeting.base_placement import find_base
 from mimic.retargeting.certificate import Certificate, certify
-from mimic.retargeting.motions import largest_jump, retarget_motion
+from mimic.retargeting.motions import largest_jump, retarget_motions
 from mimic.retargeting.self_collision import make_contacts
 from mimic.runs.files import finite, written_atomically
 
 _REPORT, _PICTURE = "report.json", "certificate.png"
 _WARNING = "warning"  # how notes begin that are printed before the work
 _ATTEMPTS, _FEW = 4, 0.2  # for each episode; fraction of its frames that fail
-_THREADS = 8  # at most; each holds an episode
+_THREADS = 8  # at most; each certifies an episode
+_AT_ONCE = {"cpu": 2**12, "gpu": 2**16}  # frames of a group of episodes; a longer episode is a group of its own
 _SHOWN = 12  # episodes in the table; those that fail come first
 _POSITION_ALONE = 0.5  # of the frames that fail: with so many whose hand is at its place, the rotation is what fails
 
@@ -113,49 +116,65 @@ def prepare_data_set(config: RetargetConfig) -> Callable[[], int]:
 
 
 def _retargeted(data: DataSet, setting: _Setting) -> Iterator[tuple[str, tuple[dict[str, Motion], Certificate]]]:
-    """Each episode's name, motions and certificate; the first one compiles, and the others are computed in threads."""
-    first, *others = data.measured
-    yield first, retarget_episode(data, first, setting)
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as pool:
-        yield from zip(others, pool.map(lambda name: retarget_episode(data, name, setting), others), strict=True)
+    """Each episode's name, motions and certificate, by groups of episodes."""
+    names, at_once = list(data.measured), _AT_ONCE["cpu" if compat.is_cpu() else "gpu"]
+    ends = np.cumsum([len(data.measured[name].time) for name in names])
+    for _, group in itertools.groupby(zip(names, ends, strict=True), key=lambda item: (item[1] - 1) // at_once):
+        yield from retarget_episodes(data, [name for name, _ in group], setting).items()
 
 
-def retarget_episode(data: DataSet, name: str, setting: _Setting) -> tuple[dict[str, Motion], Certificate]:
-    """The learner's motions of an episode by entry, and the certificate of the measured one.
+def retarget_episodes(
+    data: DataSet, names: Sequence[str], setting: _Setting
+) -> dict[str, tuple[dict[str, Motion], Certificate]]:
+    """The learner's motions of episodes by entry, and the certificates of the measured ones.
 
-    An episode of which few frames fail is searched again from other random poses; the motion with the fewest counts.
+    Episodes of which few frames fail are searched again from other random poses; the motion with the fewest counts.
     Commands are retargeted with the measured motion, as one path there and back, so that both have one posture and
     the lag between them stays.
     """
-    found, best = _retarget_from(data, name, setting)
+    best = dict(zip(names, _retarget_from(data, names, setting), strict=True))
+    again = list(names)
     for attempt in range(1, _ATTEMPTS):
-        if not 0 < np.mean(np.array(best.causes) != "") < _FEW:
+        again = [name for name in again if 0 < np.mean(np.array(best[name][1].causes) != "") < _FEW]
+        if not again:
             break
-        other, certificate = _retarget_from(data, name, setting._replace(seed=setting.seed + attempt))
-        if sum(map(bool, certificate.causes)) < sum(map(bool, best.causes)):
-            found, best = other, certificate
-    return found, best
+        others = _retarget_from(data, again, setting._replace(seed=setting.seed + attempt))
+        for name, other in zip(again, others, strict=True):
+            if sum(map(bool, other[1].causes)) < sum(map(bool, best[name][1].causes)):
+                best[name] = other
+    return best
 
 
-def _retarget_from(data: DataSet, name: str, setting: _Setting) -> tuple[dict[str, Motion], Certificate]:
-    """See `retarget_episode`; from the random poses of one seed."""
-    measured = data.measured[name]
-    count, jump = len(measured.time), largest_jump(setting.learner, setting.dt)
-    parts = [motions[name].qpos[:: (-1) ** index] for index, motions in enumerate(data.motions.values())]
-    path = retarget_motion(
-        setting.expert, setting.learner, np.concatenate(parts), setting.metric, hand=setting.hand, base=setting.base,
+def _retarget_from(
+    data: DataSet, names: Sequence[str], setting: _Setting
+) -> Iterator[tuple[dict[str, Motion], Certificate]]:
+    """See `retarget_episodes`; from the random poses of one seed."""
+    jump = largest_jump(setting.learner, setting.dt)
+    paths = [
+        np.concatenate([motions[name].qpos[:: (-1) ** index] for index, motions in enumerate(data.motions.values())])
+        for name in names
+    ]
+    found = retarget_motions(
+        setting.expert, setting.learner, paths, setting.metric, hand=setting.hand, base=setting.base,
         largest_jump=jump, seed=setting.seed, costs=setting.costs, capsules=setting.capsules,
     )  # fmt: skip
-    found = {}
-    for index, entry in enumerate(data.motions):
-        qpos = path[index * count : (index + 1) * count][:: (-1) ** index]
-        qvel = np.gradient(qpos, measured.time, axis=0)
-        found[entry] = Motion(measured.time, qpos, qvel, setting.openings[entry][name])
-    certificate = certify(
-        setting.expert, setting.learner, measured.qpos, found[data.entry].qpos, jump,
-        base=setting.base, capsules=setting.capsules, contacts=setting.contacts, demands_hand=setting.hand == "exact",
-    )  # fmt: skip
-    return found, certificate
+
+    def certified(name: str, path: np.ndarray) -> tuple[dict[str, Motion], Certificate]:
+        measured, motions = data.measured[name], {}
+        count = len(measured.time)
+        for index, entry in enumerate(data.motions):
+            qpos = path[index * count : (index + 1) * count][:: (-1) ** index]
+            qvel = np.gradient(qpos, measured.time, axis=0)
+            motions[entry] = Motion(measured.time, qpos, qvel, setting.openings[entry][name])
+        certificate = certify(
+            setting.expert, setting.learner, measured.qpos, motions[data.entry].qpos, jump,
+            base=setting.base, capsules=setting.capsules, contacts=setting.contacts,
+            demands_hand=setting.hand == "exact",
+        )  # fmt: skip
+        return motions, certificate
+
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as pool:
+        yield from pool.map(certified, names, found)
 
 
 def mapped_grippers(

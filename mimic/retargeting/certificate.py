@@ -114,24 +114,25 @@ def certify(
         touches = clearance < 0
         touches[touches] = contacts(qpos[touches])
     is_exact = (position <= POSITION) & (rotation <= ROTATION)
-    causes = []
-    for frame in range(len(qpos)):
-        cause = ""
-        if margins[frame].min() < -_ROUNDING:
+    least, fastest = margins.min(axis=1), steps.max(axis=1)
+    fails = (least < -_ROUNDING) | (fastest > 1 + _ROUNDING) | touches | (demands_hand & ~is_exact)
+    causes = [""] * len(qpos)
+    for frame in np.flatnonzero(fails):
+        if least[frame] < -_ROUNDING:
             cause = f"{learner.joint_names[int(margins[frame].argmin())]} beyond its range"
-        elif steps[frame].max() > 1 + _ROUNDING:
+        elif fastest[frame] > 1 + _ROUNDING:
             cause = f"{learner.joint_names[int(steps[frame].argmax())]} beyond its velocity limit"
         elif touches[frame]:
             cause = "links touch"
-        elif demands_hand and not is_exact[frame]:
+        else:
             near = steps[max(frame - 1, 0) : frame + 1].max(axis=0)
             cause = "hand out of reach"
             if near.max() > _AT_LIMIT:
                 cause = f"hand not reached: {learner.joint_names[int(near.argmax())]} is at its velocity limit"
-            elif margins[frame].min() < _AT_RANGE:
+            elif least[frame] < _AT_RANGE:
                 cause = f"hand not reached: {learner.joint_names[int(margins[frame].argmin())]} is at its range"
-        causes.append(cause)
-    return Certificate(position, rotation, margins.min(axis=1), steps.max(axis=1), clearance, tuple(causes))
+        causes[frame] = cause
+    return Certificate(position, rotation, least, fastest, clearance, tuple(causes))
 
 
 def hand_errors(

@@ -7,11 +7,13 @@ import jax
 import numpy as np
 from jax import Array
 
+from mimic.base import compat
 from mimic.base.compilation import compiled_once
 from mimic.retargeting.exact_pose import exact_solver
 from mimic.retargeting.hand_target import Placement
 
 CHUNK = 256  # times
+_ELSEWHERE = 8  # such chunks at once, where these are not on a CPU
 
 
 def in_chunks(rows: np.ndarray, size: int, overlap: int = 0) -> Iterator[np.ndarray]:
@@ -25,8 +27,9 @@ def in_chunks(rows: np.ndarray, size: int, overlap: int = 0) -> Iterator[np.ndar
 
 
 def by_chunks(function: Callable[..., Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-    """A function of chunks of rows, for all rows."""
-    chunks = zip(*(in_chunks(array, CHUNK) for array in arrays), strict=True)
+    """A function of chunks of rows, for all rows; of larger chunks where a call costs more."""
+    size = CHUNK if compat.is_cpu() else _ELSEWHERE * CHUNK
+    chunks = zip(*(in_chunks(array, size) for array in arrays), strict=True)
     results = [function(*chunk) for chunk in chunks]
     return tuple(np.concatenate(jax.device_get(part))[: len(arrays[0])] for part in zip(*results, strict=True))
 

@@ -1,6 +1,6 @@
 """Motions of a learner that resemble those of an expert under a metric, one trajectory at a time."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -13,7 +13,11 @@ from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.costs import Costs
-from mimic.retargeting.pose import PoseImitation
+from mimic.retargeting.exact_pose import SET
+from mimic.retargeting.exact_trajectory import exact_trajectories
+from mimic.retargeting.hand_target import placement
+from mimic.retargeting.initial_guesses import random_poses
+from mimic.retargeting.pose import STARTS, PoseImitation, check_hand
 from mimic.retargeting.trajectory import imitate_trajectory
 
 _CHUNK = 256  # times
@@ -51,10 +55,10 @@ def optimal_motions(
     return jax.jit(lambda all_qpos: jax.lax.map(imitate, all_qpos))(qpos)
 
 
-def retarget_motion(
+def retarget_motions(
     expert: Embodiment,
     learner: Embodiment,
-    qpos: Float[np.ndarray, "time joints"],
+    motions: Sequence[Float[np.ndarray, "time joints"]],
     metric: MetricConfig,
     *,
     hand: str = "exact",
@@ -63,13 +67,13 @@ def retarget_motion(
     seed: int = 0,
     costs: Costs | None = None,
     capsules: Capsules | None = None,
-) -> Float[np.ndarray, "time learner_joints"]:
-    """The learner's motion [rad] for one of the expert, of any length.
+) -> Iterator[Float[np.ndarray, "time learner_joints"]]:
+    """The learner's motion [rad] for each of the expert, of any lengths.
 
     Args:
       expert: n joints.
       learner: n_hat joints.
-      qpos: [T, n] the expert's motion [rad].
+      motions: [T, n] each, the expert's [rad].
       metric: chooses among the postures, or the motion with hand="scaled".
       hand: "exact" or "near" for the expert's hand in metres, or the nearest one; "scaled" for the metric alone, in
         chain lengths.
@@ -77,13 +81,27 @@ def retarget_motion(
       largest_jump: maximum change of each joint between two times [rad].
       seed: of the random initial poses.
       costs, capsules: see `imitate_trajectory`.
+
+    Raises:
+      ValueError: what `imitate_trajectory` rejects.
     """
-    options: dict[str, Any] = {} if hand == "scaled" else {"hand": "exact", "base": base}
-    count = len(qpos)
-    if hand == "scaled":  # padded, so that motions of similar lengths share what is compiled
-        qpos = qpos[np.minimum(np.arange(-(-count // _CHUNK) * _CHUNK), count - 1)]
-    solution = imitate_trajectory(
-        expert, learner, jnp.asarray(qpos, jnp.float32), largest_jump=largest_jump, key=jax.random.key(seed),
-        costs=costs, capsules=capsules, **metric.build(expert, learner).arguments, **options,
-    )  # fmt: skip
-    return np.asarray(solution.qpos, float)[:count]
+    built, key, costs = metric.build(expert, learner), jax.random.key(seed), Costs() if costs is None else costs
+    if hand != "scaled":
+        check_hand("exact", base, expert, learner)
+        costs.check_capsules(capsules)
+        jump, random = (
+            np.asarray(largest_jump, np.float32),
+            random_poses(learner, key, STARTS["exact"], np.float32, SET),
+        )
+        arguments = placement(base), jump, random, costs, capsules if costs.of_capsules else None
+        poses = [np.asarray(qpos, np.float32) for qpos in motions]
+        for solution in exact_trajectories(expert, learner, built, poses, *arguments):
+            yield np.asarray(solution.qpos, float)
+        return
+    for qpos in motions:  # padded, so that motions of similar lengths share what is compiled
+        padded = qpos[np.minimum(np.arange(-(-len(qpos) // _CHUNK) * _CHUNK), len(qpos) - 1)]
+        solution = imitate_trajectory(
+            expert, learner, jnp.asarray(padded, jnp.float32), largest_jump=largest_jump, key=key, costs=costs,
+            capsules=capsules, **built.arguments,
+        )  # fmt: skip
+        yield np.asarray(solution.qpos, float)[: len(qpos)]

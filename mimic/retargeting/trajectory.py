@@ -21,7 +21,7 @@ from mimic.metric.kinematics import link_states
 from mimic.retargeting.closed_form import ROUGH_SMOOTHING
 from mimic.retargeting.costs import Costs, smoothness_derivatives, sum_of, with_costs
 from mimic.retargeting.exact_pose import SET
-from mimic.retargeting.exact_trajectory import exact_trajectory
+from mimic.retargeting.exact_trajectory import exact_trajectories
 from mimic.retargeting.hand_target import placement
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
 from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, Store, newton
@@ -108,11 +108,12 @@ def imitate_trajectory(
     metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
     capsules = capsules if costs.of_capsules else None
     if hand == "exact":
-        if costs.of_motion or has_tracer(poses):
-            raise ValueError("costs, qpos: expected no costs of motion and no tracer for exact hands")
+        if has_tracer(poses):
+            raise ValueError("qpos: expected no tracer for exact hands")
         motion, limit = np.asarray(poses, np.float32), np.asarray(jump, np.float32)
         random = random_poses(learner, key, max(starts, 1), np.float32, SET)
-        return exact_trajectory(expert, learner, metric, motion, placement(base), limit, random, costs, capsules)
+        arguments = placement(base), limit, random, costs, capsules
+        return next(exact_trajectories(expert, learner, metric, [motion], *arguments))
     solve = _trajectory_solver(expert, learner, metric, bool(starts), costs, capsules)
     return solve(poses, jump, random_poses(learner, key, max(starts, 1), poses.dtype))
 

@@ -2,18 +2,23 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mimic.arms.embodiment import Embodiment, panda, planar_arm
 from mimic.arms.link_match import hand_poses
+from mimic.base import compat
 from mimic.metric.config import MetricConfig
 from mimic.metric.distance import embodiment_distance
 from mimic.metric.kinematics import link_states
+from mimic.retargeting import exact_candidates
 from mimic.retargeting.base_placement import find_base, repeated
+from mimic.retargeting.costs import NO_COSTS
+from mimic.retargeting.exact_candidates import Candidates, candidates_of_motions
 from mimic.retargeting.exact_chunks import in_chunks
-from mimic.retargeting.exact_trajectory import Candidates, best_path, within_ranges
+from mimic.retargeting.exact_trajectory import best_path, steps_between, within_ranges
 from mimic.retargeting.hand_speeds import speeds_needed
 from mimic.retargeting.hand_target import (
     POSITION_TOLERANCE,
@@ -23,6 +28,7 @@ from mimic.retargeting.hand_target import (
     hands,
     placement,
 )
+from mimic.retargeting.initial_guesses import random_poses
 from mimic.retargeting.pose import imitate_pose
 from mimic.retargeting.trajectory import imitate_trajectory
 
@@ -167,8 +173,42 @@ def test_the_best_path_leaves_a_branch_only_where_that_pays():
     """Two branches 1 rad apart, each better by 1 in one half; ten steps lie between them."""
     late = (np.arange(40) >= 20).astype(float)
     candidates = Candidates(np.array([0.0, 1.0])[None, :, None] * np.ones((40, 1, 1)), np.stack([late, 1 - late], 1))
-    np.testing.assert_array_equal(best_path(candidates, np.array([0.1]), NEVER, 1.9)[:, 0], late)
-    assert len(np.unique(best_path(candidates, np.array([0.1]), NEVER, 2.5))) == 1
+    steps = steps_between(candidates.qpos.astype(np.float32), np.array([0.1], np.float32), NEVER)
+    np.testing.assert_array_equal(best_path(candidates, steps, NEVER, 1.9)[:, 0], late)
+    assert len(np.unique(best_path(candidates, steps, NEVER, 2.5))) == 1
+
+
+@pytest.mark.parametrize("count", [2, 256, 257, 700])
+def test_steps_to_a_candidate_are_the_times_that_it_is_late(count):
+    qpos = np.random.default_rng(0).uniform(-3, 3, (count, 2, 2)).astype(np.float32)
+    jump, continuous = np.array([0.5, 0.2], np.float32), np.array([True, False])
+    apart = qpos[1:, None] - qpos[:-1, :, None]
+    apart[..., 0] = (apart[..., 0] + np.pi) % (2 * np.pi) - np.pi
+    late = np.maximum(np.ceil(np.abs(apart / jump).max(axis=-1)) - 1, 0)
+    steps = steps_between(qpos, jump, continuous)
+    assert steps.shape == (count - 1, 2, 2)
+    assert np.mean(steps == late) > 0.999  # angles at a whole number of steps may round either way
+
+
+@pytest.mark.slow
+def test_candidates_of_many_motions_at_once_are_those_of_each(monkeypatch):
+    """As on a GPU, where the chunks of all motions are one batch, beside one chunk after another."""
+    metric, lengths = MetricConfig().build(EXPERT, EXPERT), (300, 40, 513)
+    motions = [0.3 * np.sin(np.arange(n)[:, None] / 30 + np.arange(3)).astype(np.float32) for n in lengths]
+    arms, jump = (EXPERT, EXPERT, metric, NO_COSTS, None), np.full(3, 0.1, np.float32)
+    arguments = placement(None), jump, random_poses(EXPERT, None, 4, np.float32, 16)
+    each = [candidates_of_motions(arms, [motion], *arguments)[0] for motion in motions]
+    monkeypatch.setattr(compat, "is_cpu", lambda: False)
+    for name in ("_branches", "_tracks"):  # without the cache, which has those of a CPU
+        make = getattr(exact_candidates, name).__wrapped__
+        monkeypatch.setattr(exact_candidates, name, lambda *arms, make=make: jax.jit(make(*arms)))
+    monkeypatch.setattr(exact_candidates, "_candidates", exact_candidates._candidates.__wrapped__)
+    together = candidates_of_motions(arms, motions, *arguments)
+    for one, other, length in zip(each, together, lengths, strict=True):
+        assert one.qpos.shape[0] == other.qpos.shape[0] == length
+        exact = np.minimum(one.cost.min(axis=1), other.cost.min(axis=1)) < exact_candidates.INEXACT
+        assert exact.all()
+        np.testing.assert_allclose(one.cost.min(axis=1), other.cost.min(axis=1), atol=1e-3)  # of the best branch
 
 
 def test_a_path_beyond_a_revolution_is_shifted_into_the_range():
