@@ -74,24 +74,22 @@ for name, function in (("optimiser", optimise), ("mapper", jax.jit(mapper))):
 
 # ---- A whole motion --------------------------------------------------------------------------------------------------
 #
-# A motion must be continuous, and no joint may exceed its velocity limit. `mimic.retarget` ensures both: with the
-# optimiser it tracks minima over time, with a mapper it chooses among the heads so that the motion is smooth and its
-# distance small. The results are demonstrations of the learner's arm. First, motions of the expert to retarget:
+# A motion must be continuous, and no joint may exceed its velocity limit. `mimic.retarget` ensures both: it tracks
+# minima over time. A mapper maps each pose alone, and may jump from one minimum to another. First, motions of the
+# expert to retarget:
 
 motions = mimic.record_demonstrations(mimic.build_arm(env.expert), 4)
 motions.save(out / "expert.npz")
-files = {"optimiser": out / "optimised.npz", "mapper": out / "mapped.npz"}
-command("retarget", f"demonstrations={out / 'expert.npz'}", "learner=panda4dof", f"out={files['optimiser']}")
 command(
-    "retarget", f"demonstrations={out / 'expert.npz'}", "learner=panda4dof", f"out={files['mapper']}",
-    f"mapper={mapper_run}",
+    "retarget", f"source={out / 'expert.npz'}", "learner=panda4dof", "hand=scaled", "limits=none",
+    f"out={out / 'optimised'}",
 )  # fmt: skip
 
 # ---- Compare the motions ---------------------------------------------------------------------------------------------
 #
 # Both motions are compared by their distance over time; a learner that holds its zero pose sets the scale. The
-# optimiser's motion is not a bound: a better pose may need a jump. Motions start at the learner's optimal pose, not in
-# its zero pose; a robot must move there first.
+# optimiser's motion is not a bound: a better pose may need a jump, as the mapper's may. Motions start at the learner's
+# optimal pose, not in its zero pose; a robot must move there first.
 
 distance = jax.jit(
     jax.vmap(
@@ -102,7 +100,10 @@ distance = jax.jit(
         )
     )
 )
-retargeted = {name: mimic.load_demonstrations(file).qpos for name, file in files.items()}
+retargeted = {
+    "optimiser": mimic.load_demonstrations(out / "optimised" / "expert.npz").qpos,
+    "mapper": np.unwrap(jax.jit(mapper)(motions.qpos.astype(np.float32)), axis=1),
+}
 retargeted["zero pose"] = np.zeros_like(retargeted["mapper"])
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
 seconds_of_motion = motions.dt * np.arange(motions.horizon + 1)

@@ -9,18 +9,19 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.arms.link_match import LinkMatch
 from mimic.base.config import check_unused
+from mimic.commands.arm_keys import ROLES, arm_of_environment
 from mimic.commands.config import RenderConfig
 from mimic.commands.retargeted_motions import read_motions
-from mimic.envs import env_config
+from mimic.envs import env_config, environments
 from mimic.envs.config import EnvConfig
-from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index, interpolate
+from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line_table, similarity
-from mimic.motions.demonstrations import Demonstrations, load_demonstrations
 from mimic.retargeting.pose import imitate_pose
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.make import make_policy_trainer
@@ -90,17 +91,13 @@ def prepare_clip(config: RenderConfig) -> ClipPlan:
       ValueError: the run directory, the checkpoint or the demonstration does not exist, files belong to other arms, or
         the keys exclude each other.
     """
-    if config.retargeted and Path(config.retargeted).expanduser().is_dir():
-        return _data_set_clip(config)
-    if config.retargeted or (config.demonstrations and not config.run):
-        return _retargeted_clip(config)
-    return _policy_clip(config)
+    return _data_set_clip(config) if config.retargeted else _policy_clip(config)
 
 
 def _policy_clip(config: RenderConfig) -> ClipPlan:
     """A policy's rollout, with the kinematic bound and the distance of holding the start pose."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
-    check_unused(config, ("demonstrations", "expert", "limits"), "with run=DIR")
+    check_unused(config, ("expert", "limits"), "with run=DIR")
     trained, trainer = make_policy_trainer(trained, run_dir, config.learner, config.locked)
     index = demonstration_index(trainer.evaluator, config.split, config.demonstration)
     _, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
@@ -127,48 +124,12 @@ def _policy_clip(config: RenderConfig) -> ClipPlan:
     return ClipPlan(trained.env, run_dir / "videos" / name, compute)
 
 
-def _retargeted_clip(config: RenderConfig) -> ClipPlan:
-    """A demonstration of the expert, and the learner's motion that `mimic.retarget` computed from it."""
-    check_unused(config, ("run", "checkpoint", "split", "locked"), "with retargeted=FILE")
-    for key, example in (("demonstrations", "EXPERT.npz"), ("retargeted", "LEARNER.npz"), ("learner", "panda4dof")):
-        if not getattr(config, key):
-            raise ValueError(f"{key}: expected with retargeted=FILE, as in {key}={example}")
-    expert_model = {"expert": {"model": config.expert, "tip": [ALL_ENDS]}} if config.expert else {}
-    env = env_config(config.learner, limits=config.limits, **expert_model)
-    expert, learner = env.build_arms().embodiments
-    demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
-    motions = load_demonstrations(Path(config.retargeted).expanduser())
-    _check_arm("demonstrations", demonstrations, expert)
-    _check_arm("retargeted", motions, learner)
-    sizes = [(arm_motions.count, arm_motions.horizon, arm_motions.dt) for arm_motions in (demonstrations, motions)]
-    if sizes[0] != sizes[1]:
-        expected, got = ("{} motions of {} steps of {} s".format(*size) for size in sizes)
-        raise ValueError(f"retargeted: expected {expected}, as in demonstrations, got {got}")
-    _check_number(config.demonstration, demonstrations)
-
-    def compute() -> Clip:
-        time, qpos = _resampled(demonstrations, config.demonstration)
-        _, learner_qpos = _resampled(motions, config.demonstration)
-        title = f"{env.name}, demonstration {config.demonstration}"
-        return _static_clip(env, title, time, qpos, learner_qpos)
-
-    return ClipPlan(env, None, compute)
-
-
 def _data_set_clip(config: RenderConfig) -> ClipPlan:
     """An episode of a data set that `mimic.retarget` wrote, beside that of its source."""
-    check_unused(config, ("run", "checkpoint", "split", "locked", "demonstrations"), "with retargeted=FOLDER")
-    arms = {key: getattr(config, key) for key in ("expert", "learner")}
-    for key, arm in arms.items():
-        if not arm:
-            raise ValueError(f"{key}: expected with retargeted=FOLDER, as mimic.retarget had it")
-    env, motions = env_config("pair", limits=config.limits, **arms), read_motions(Path(config.retargeted).expanduser())
-    for key, arm in zip(arms, env.build_arms().embodiments, strict=True):
-        if arm.joint_names != motions.joints[key]:
-            joints, found = map(", ".join, (arm.joint_names, motions.joints[key]))
-            raise ValueError(
-                f"{key}: expected the arm of the data set, with joints {found}, got {arm.name} with {joints}"
-            )
+    check_unused(config, ("run", "checkpoint", "split", "locked"), "with retargeted=FOLDER")
+    motions = read_motions(Path(config.retargeted).expanduser())
+    arms = {role: _arm_of(role, config, motions.joints[role]) for role in ROLES}
+    env = dataclasses.replace(env_config("pair", limits=config.limits), **arms)
     if config.demonstration >= len(motions.episodes):
         last = len(motions.episodes) - 1
         raise ValueError(f"demonstration: expected a number from 0 to {last}, got {config.demonstration}")
@@ -181,6 +142,29 @@ def _data_set_clip(config: RenderConfig) -> ClipPlan:
         return dataclasses.replace(_static_clip(env, title, time - time[0], *at_frames), base=motions.base)
 
     return ClipPlan(env, None, compute)
+
+
+def _arm_of(role: str, config: RenderConfig, joints: Sequence[str]) -> ArmConfig:
+    """The arm of a role by the name that the config has: the one with these joints, at all of its ends if need be.
+
+    Raises:
+      ValueError: there is no name, or it is that of another arm.
+    """
+    name = getattr(config, role)
+    if not name:
+        raise ValueError(f"{role}: expected with retargeted=FOLDER, as mimic.retarget had it")
+    first = arm_of_environment(role, name) if name in environments() else ArmConfig(model=name)
+    others = []
+    for candidate in [first, dataclasses.replace(first, tip=[ALL_ENDS])] if first.is_file else [first]:
+        try:
+            arm = build_arm(candidate, config.limits).embodiment
+        except ValueError as error:  # a model that branches, whose ends count only together
+            others.append(str(error))
+            continue
+        if arm.joint_names == tuple(joints):
+            return candidate
+        others.append(f"{arm.name} with {', '.join(arm.joint_names)}")
+    raise ValueError(f"{role}: expected the arm of the data set, with joints {', '.join(joints)}, got {others[0]}")
 
 
 def _static_clip(env: EnvConfig, title: str, time: np.ndarray, qpos: np.ndarray, learner_qpos: np.ndarray) -> Clip:
@@ -213,22 +197,3 @@ def _static_clip(env: EnvConfig, title: str, time: np.ndarray, qpos: np.ndarray,
 def _similarity(arms: tuple[Embodiment, Embodiment], poses: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
     """Similarity measures of two arms at each frame."""
     return similarity(*(centre_line_table(arm, qpos) for arm, qpos in zip(arms, poses, strict=True)))
-
-
-def _resampled(motions: Demonstrations, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times and joint positions of one motion, at the frames of the video."""
-    time = np.arange(0, motions.horizon * motions.dt + 1e-9, 1 / FRAMES_PER_SECOND)
-    return time, interpolate(motions.qpos[number], motions.qvel[number], motions.dt, time)
-
-
-def _check_arm(key: str, motions: Demonstrations, arm: Embodiment) -> None:
-    if (motions.arm, motions.joint_names) != (arm.name, arm.joint_names):
-        raise ValueError(
-            f"{key}: expected motions of {arm.name} with joints {', '.join(arm.joint_names)}, "
-            f"got {motions.arm} with {', '.join(motions.joint_names)}"
-        )
-
-
-def _check_number(number: int, motions: Demonstrations) -> None:
-    if not 0 <= number < motions.count:
-        raise ValueError(f"demonstration: expected an index of the file from 0 to {motions.count - 1}, got {number}")

@@ -124,15 +124,11 @@ class RenderConfig:
       run: run directory of a policy.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
       split: "held_out" or "train": demonstrations of a policy's run.
-      demonstration: index from 0 into the split, or into the file.
-      demonstrations: file of the expert's demonstrations.
-      retargeted: file of the learner's motions that `mimic.retarget` computed from `demonstrations`, or folder of the
-        data set that it wrote.
-      learner: name of the environment that the file was computed for; of a data set and of a run of many arms, name or
-        file of the arm.
-      locked: numbers or names of the joints of this arm that are locked.
-      expert: model of the arm in `demonstrations`, as of a captured person, or of the source of a data set. Default "":
-        the environment's expert.
+      demonstration: index from 0 into the split, or of the episode of the data set.
+      retargeted: folder of the data set that `mimic.retarget` wrote.
+      expert: its expert: name or file of an arm, or an environment that has it.
+      learner: its learner, in the same way; of a run of many arms, name or file of the arm.
+      locked: numbers or names of the joints of this arm that are locked; of a run of many arms.
       limits: the `limits` that `retargeted` was computed with, see `EnvConfig`.
       out: video file. Default "": a file in the folder `videos` of the run directory.
       compilation_cache: see `TrainConfig`.
@@ -142,7 +138,6 @@ class RenderConfig:
     checkpoint: int | None = checkpoint_number()
     split: str = "held_out"
     demonstration: int = number(0, at_least=0, at_most=1_000_000)
-    demonstrations: str = ""
     retargeted: str = ""
     learner: str = ""
     locked: list[Any] = dataclasses.field(default_factory=list)
@@ -165,9 +160,7 @@ class DatasetConfig:
       run: run directory of a policy.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
       split: "held_out" or "train": demonstrations of the run to roll the policy out on. Default "": both.
-      demonstrations: file of motions to write instead of rollouts: demonstrations, or those of `mimic.retarget`.
-      retargeted: file of the learner's motions that `mimic.retarget` computed from `demonstrations`, which are then
-        the expert's.
+      demonstrations: file of motions to write instead of rollouts.
       format: "lerobot" or "rosbag2".
       task: what the robot does, in words. Default "": made of the names of environment and arms.
       out: folder of the dataset; must not exist.
@@ -178,7 +171,6 @@ class DatasetConfig:
     checkpoint: int | None = checkpoint_number()
     split: str = ""
     demonstrations: str = ""
-    retargeted: str = ""
     format: str = "lerobot"
     task: str = ""
     out: str = ""
@@ -356,20 +348,19 @@ class RetargetConfig:
     """Config of a retargeting of a data set, or of demonstrations.
 
     Attributes:
-      source: data set of the expert to write again as one of the learner, see `import_demonstrations` for formats.
-      hand: with `source`: "exact" for the expert's hand in metres, which each frame must keep; "near" for the nearest
+      source: data set of the expert to write again as one of the learner, see `import_demonstrations` for formats; or a
+        file of demonstrations.
+      hand: "exact" for the expert's hand in metres, which each frame must keep; "near" for the nearest
         one within the limits; "scaled" for the pose that resembles the expert's, in chain lengths.
-      base: with `source`: "same" for the learner's base where the expert's is, "auto" for where most frames are exact,
+      base: "same" for the learner's base where the expert's is, "auto" for where most frames are exact,
         or [x,y,z,yaw] in the expert's base frame [m, rad].
-      failing: with `source`: what becomes of episodes that fail, "left_out" or "kept".
+      failing: what becomes of episodes that fail, "left_out" or "kept".
       joints, topic, units, rate: of `source`, see `RecordingConfig`.
-      demonstrations: file of the expert's demonstrations, in place of `source`.
       env: environment that defines the arms and the metric.
-      mapper: run directory of a pose mapper of these arms, used instead of the optimiser.
-      limits: see `EnvConfig`. Default None: those of the environment; with `source` those of the models.
-      out: folder of the data set, or file of the learner's motions; must not exist.
-      costs: see `Costs`; of the optimiser.
-      seed: seed of the random initial poses of the optimiser.
+      limits: see `EnvConfig`. Default None: those of the models.
+      out: folder of the learner's data set; must not exist.
+      costs: see `Costs`.
+      seed: seed of the random initial poses.
       compilation_cache: see `TrainConfig`.
     """
 
@@ -381,9 +372,7 @@ class RetargetConfig:
     topic: str = ""
     units: str = ""
     rate: float | None = number(None, at_least=0.1, at_most=1e5)
-    demonstrations: str = ""
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
-    mapper: str = ""
     limits: str | None = None
     out: str = ""
     costs: Costs = dataclasses.field(default_factory=Costs)
@@ -392,10 +381,6 @@ class RetargetConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        if self.mapper and self.costs != Costs():
-            raise ValueError("costs: expected none with a mapper, which does not minimise them")
-        if self.source and (self.demonstrations or self.mapper):
-            raise ValueError("source: expected neither demonstrations= nor mapper= with a data set")
         check_choice("hand", self.hand, _HANDS)
         check_choice("failing", self.failing, _FAILING)
         _ = self.placement
@@ -407,8 +392,7 @@ class RetargetConfig:
 
     def resolve(self) -> EnvConfig:
         """Returns the environment with the limits set in this config."""
-        limits = self.limits or ("hardware" if self.source else None)
-        return dataclasses.replace(self.env, **_without_none({"limits": limits}))
+        return dataclasses.replace(self.env, limits=self.limits or "hardware")
 
 
 _FOLLOWED = "free", "exact", "relative"

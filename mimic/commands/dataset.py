@@ -60,9 +60,7 @@ def _check_keys(config: DatasetConfig) -> None:
         raise ValueError(
             f"run, demonstrations: expected one of them, as in run=runs/NAME or demonstrations=FILE.npz, got {got}"
         )
-    if config.run:
-        check_unused(config, ("retargeted",), "with run=DIR")
-    else:
+    if not config.run:
         check_unused(config, ("checkpoint", "split"), "without run=DIR")
 
 
@@ -96,10 +94,9 @@ def _prepare_rollouts(config: DatasetConfig) -> Callable[[Console], _Computed]:
 def _prepare_files(config: DatasetConfig) -> Callable[[Console], _Computed]:
     """Loads motions; the returned function returns them."""
     demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
-    retargeted = load_demonstrations(Path(config.retargeted).expanduser()) if config.retargeted else None
     _check_time_step(config.format, demonstrations.dt)
-    kind = "retargeted motions" if retargeted else "motions of a file"
-    episodes = file_episodes(demonstrations, retargeted, config.task, _provenance(kind, {"seed": demonstrations.seed}))
+    provenance = _provenance("motions of a file", {"seed": demonstrations.seed})
+    episodes = file_episodes(demonstrations, config.task, provenance)
     return lambda console: (episodes, [])
 
 

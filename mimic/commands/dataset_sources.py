@@ -61,24 +61,11 @@ def steps_before_runaway(qvel: np.ndarray, speed_bound: float) -> np.ndarray:
     return np.where(runaway.any(axis=1), runaway.argmax(axis=1), qvel.shape[1])
 
 
-def file_episodes(
-    demonstrations: Demonstrations, retargeted: Demonstrations | None, task: str, provenance: dict[str, Any]
-) -> Episodes:
-    """The motions of a file; with retargeted ones, these are the robot's and the others the expert's.
-
-    Raises:
-      ValueError: the two have other numbers of motions, lengths or time steps.
-    """
-    sizes = [(motions.count, motions.horizon, motions.dt) for motions in (demonstrations, retargeted or demonstrations)]
-    if sizes[0] != sizes[1]:
-        expected, got = ("{} motions of {} steps of {} s".format(*size) for size in sizes)
-        raise ValueError(f"retargeted: expected {expected}, as in demonstrations, got {got}")
-    count, horizon, dt = sizes[0]
-    expert, robot = _arm_motions(demonstrations), _arm_motions(retargeted or demonstrations)
-    task = task or (f"imitate the motion of {expert.arm} with {robot.arm}" if retargeted else f"move {robot.arm}")
-    return Episodes(
-        dt, task, robot, expert if retargeted else None, [horizon] * count, ["train"] * count, range(count), provenance
-    )
+def file_episodes(demonstrations: Demonstrations, task: str, provenance: dict[str, Any]) -> Episodes:
+    """The motions of a file."""
+    count, steps = demonstrations.count, [demonstrations.horizon] * demonstrations.count
+    task, robot = task or f"move {demonstrations.arm}", _arm_motions(demonstrations)
+    return Episodes(demonstrations.dt, task, robot, None, steps, ["train"] * count, range(count), provenance)
 
 
 def _arm_motions(motions: Demonstrations) -> ArmMotions:

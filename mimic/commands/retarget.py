@@ -1,213 +1,333 @@
 """`python -m mimic.retarget`: a data set or demonstrations of one arm as those of another."""
 
-from collections.abc import Callable, Mapping
+import dataclasses
+import itertools
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
-from mimic.arms.arm import finite_velocity_limit
+from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
-from mimic.arms.pose_limits import continuous_joints, pose_limits
+from mimic.arms.gripper import GripperRange, gripper_range
+from mimic.base import compat
 from mimic.base.compilation import use_compilation_cache
-from mimic.base.config import new_file
+from mimic.base.config import new_folder
+from mimic.base.files import write_atomically
+from mimic.commands.certificate_plot import plot_certificates
 from mimic.commands.config import RetargetConfig
-from mimic.commands.retarget_data import prepare_data_set
-from mimic.evaluation.rollout_metrics import pose_similarity
+from mimic.commands.retargeted_motions import save_motions
 from mimic.metric.config import MetricConfig
-from mimic.motions.demonstrations import Demonstrations, load_demonstrations
-from mimic.retargeting.costs import Costs
-from mimic.retargeting.motions import largest_jump, optimal_motions
-from mimic.retargeting.pose import wrap_angles
-from mimic.trainers.pose_mapper.mapper import PoseMapper
-from mimic.trainers.progress import similarity_table
+from mimic.motions.formats.episodes import Motion
+from mimic.motions.grippers import other_gripper
+from mimic.motions.rewriting import DataSet, read_data_set, write_data_set
+from mimic.retargeting.base_placement import find_base
+from mimic.retargeting.certificate import Certificate, certify
+from mimic.retargeting.motions import largest_jump, retarget_motions
+from mimic.retargeting.self_collision import make_contacts
+from mimic.runs.files import finite, written_atomically
+
+_REPORT, _PICTURE = "report.json", "certificate.png"
+_WARNING = "warning"  # how notes begin that are printed before the work
+_ATTEMPTS, _FEW = 4, 0.2  # for each episode; fraction of its frames that fail
+_THREADS = 8  # at most; each certifies an episode
+_AT_ONCE = {"cpu": 2**12, "gpu": 2**16}  # frames of a group of episodes; a longer episode is a group of its own
+_SHOWN = 12  # episodes in the table; those that fail come first
+_POSITION_ALONE = 0.5  # of the frames that fail: with so many whose hand is at its place, the rotation is what fails
 
 
-# Above 40 lines because of its docstring.
-def retarget(
-    demonstrations: Demonstrations,
-    expert: Embodiment,
-    learner: Embodiment,
-    metric: MetricConfig,
-    *,
-    mapper: PoseMapper | None = None,
-    seed: int = 0,
-    costs: Costs | None = None,
-    capsules: Capsules | None = None,
-) -> tuple[Demonstrations, dict[str, Any]]:
-    """Retargets demonstrations of the expert to the learner, pose by pose, with bounded joint velocities.
+class _Setting(NamedTuple):
+    """What all episodes of a data set share; `openings` are the learner's, by entry and episode."""
 
-    No joint exceeds its velocity limit, or pi rad/s where the limit is unknown. Velocities are central differences.
+    expert: Embodiment
+    learner: Embodiment
+    metric: MetricConfig
+    hand: str
+    base: list[float] | None
+    dt: float
+    seed: int
+    grippers: tuple[GripperRange | None, GripperRange | None]
+    openings: Mapping[str, Mapping[str, np.ndarray | None]]
+    costs: Any
+    capsules: Capsules | None
+    contacts: Callable[..., Any] | None
 
-    Args:
-      demonstrations: demonstrations of the expert.
-      expert: arm with n joints.
-      learner: arm with n_hat joints.
-      metric: metric to minimise; its weights on velocities are ignored.
-      mapper: proposes the poses, see `follow_mapper`. Default None: the optimiser, see `imitate_trajectory`.
-      seed: seed of the random initial poses of the optimiser.
-      costs: see `imitate_trajectory`; of the optimiser.
-      capsules: see `imitate_trajectory`.
 
-    Returns:
-      The learner's motions, and a report: `distance`, the mean over all poses; `largest_jump` [rad], the maximum change
-      of a joint in a time step; `settled`, the fraction of poses at a minimum, or at a pose proposed by the mapper;
-      `similarity`, means of the measures of `mimic.metric.similarity` for the motions and for
-      `mimic.retargeting.pose_baselines.BASELINES`.
+def prepare_retargeting(config: RetargetConfig) -> Callable[[], int]:
+    """Checks the config and reads the data set; the returned function retargets, certifies and writes it.
 
     Raises:
-      ValueError: the demonstrations belong to another arm or leave its joint range, or the mapper is for other arms.
-    """
-    check_poses(demonstrations, expert)
-    jump = largest_jump(learner, demonstrations.dt)
-    expert_qpos = jnp.asarray(demonstrations.qpos, jnp.float32)
-    if mapper is None:
-        solution = optimal_motions(expert, learner, expert_qpos, metric, jump, seed, costs=costs, capsules=capsules)
-        learner_qpos, distance, settled = solution.qpos, solution.distance, solution.converged
-    else:
-        mapper.check_fits(expert, learner)
-        learner_qpos, distance, settled = follow_mapper(mapper, expert_qpos, jump)
-    qpos = np.asarray(learner_qpos, float)
-    report = {
-        "distance": float(np.mean(np.asarray(distance))),
-        "largest_jump": float(np.abs(np.diff(qpos, axis=1)).max()),
-        "settled": float(np.mean(np.asarray(settled))),
-        "similarity": pose_similarity(expert, learner, demonstrations.qpos, {"retargeted": qpos}),
-    }
-    return _motions(learner, qpos, demonstrations.dt, demonstrations.seed), report
-
-
-def _motions(learner: Embodiment, qpos: np.ndarray, dt: float, seed: int) -> Demonstrations:
-    limit, velocity = finite_velocity_limit(learner), np.gradient(qpos, dt, axis=1)
-    return Demonstrations(
-        qpos=qpos,
-        qvel=np.clip(velocity, -limit, limit),  # float32 rounding may lift a jump above its bound
-        goals=qpos[:, -1],
-        dt=dt,
-        arm=learner.name,
-        joint_names=learner.joint_names,
-        seed=seed,
-    )
-
-
-def follow_mapper(
-    mapper: PoseMapper, qpos: Float[Array, "motions time joints"], largest_jump: Float[np.ndarray, " learner_joints"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Computes motions through the poses that a pose mapper proposes.
-
-    The mapper has several candidates for each time step. Dynamic programming selects one at each step, such that
-    the sum over the motion of the distances and of the jumps' excess over `largest_jump` [rad] is minimal. Jumps that
-    still exceed their bound are cut off at it.
-
-    Args:
-      mapper: pose mapper between the two arms.
-      qpos: the expert's motions [rad].
-      largest_jump: maximum change of each joint in a time step [rad].
-
-    Returns:
-      The learner's poses [motions, time, learner_joints] [rad], their distances [motions, time], and whether each pose
-      equals the proposed one [motions, time].
-    """
-    candidates = jax.jit(jax.vmap(jax.vmap(mapper.candidates)))(qpos)
-    distances = jax.jit(jax.vmap(jax.vmap(jax.vmap(mapper.distance, (None, 0)))))(qpos, candidates)
-    continuous = continuous_joints(mapper.learner)
-
-    def motion(candidates: Array, distances: Array) -> tuple[Array, Array]:
-        selected = _select_candidates(candidates, distances, largest_jump, continuous)
-        proposed = jnp.take_along_axis(candidates, selected[:, None, None], axis=1)[:, 0]
-
-        def follow(pose: Array, target: Array) -> tuple[Array, tuple[Array, Array]]:
-            change = wrap_angles(target - pose, continuous)
-            bounded = jnp.clip(change, -largest_jump, largest_jump)
-            return pose + bounded, (pose + bounded, jnp.all(bounded == change))
-
-        _, (poses, settled) = jax.lax.scan(follow, proposed[0], proposed)
-        return poses, settled
-
-    poses, settled = jax.jit(jax.vmap(motion))(candidates, distances)
-    distance = jax.jit(jax.vmap(jax.vmap(mapper.distance)))(qpos, poses)
-    return np.asarray(poses), np.asarray(distance), np.asarray(settled)
-
-
-def _select_candidates(candidates: Array, distances: Array, largest_jump: np.ndarray, continuous: np.ndarray) -> Array:
-    """The candidate [time] of the mapper for each step of a motion, by dynamic programming; see `follow_mapper`."""
-
-    def extend(cost: Array, step: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        previous, current, distance = step
-        change = jnp.abs(wrap_angles(current[None] - previous[:, None], continuous))
-        total = cost[:, None] + jnp.maximum(change - largest_jump, 0).sum(axis=-1)
-        return total.min(axis=0) + distance, total.argmin(axis=0)
-
-    cost, predecessors = jax.lax.scan(extend, distances[0], (candidates[:-1], candidates[1:], distances[1:]))
-    last = cost.argmin()
-    _, selected = jax.lax.scan(lambda after, row: (row[after], row[after]), last, predecessors, reverse=True)
-    return jnp.append(selected, last)
-
-
-def prepare_retargeting(config: RetargetConfig) -> Callable[[], int | None]:
-    """Checks the config of a retargeting and loads its files.
-
-    Raises:
-      ValueError: a file name is missing, `out` exists, or a file belongs to other arms.
+      ValueError: a key without effect, a source that cannot be read, arms without the hands that `hand` needs, or `out`
+        exists.
     """
     use_compilation_cache(config.compilation_cache)
-    if config.source:
-        return prepare_data_set(config)
-    if not config.demonstrations:
-        raise ValueError(
-            "source, demonstrations: expected a data set or a file of demonstrations, as in source=FOLDER or "
-            "demonstrations=FILE"
-        )
-    out = new_file("out", config.out)
-    env = config.resolve()
+    if not config.source:
+        raise ValueError("source: expected a data set or a file of demonstrations, as in source=FOLDER")
+    out, env = new_folder("out", config.out), config.resolve()
     expert, learner = env.build_arms().embodiments
-    demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
-    check_poses(demonstrations, expert)
-    capsules = fit_capsules(env.learner, env.limits) if config.costs.of_capsules else None
-    mapper = None
-    if config.mapper:
-        mapper = PoseMapper.load(Path(config.mapper).expanduser())
-        mapper.check_fits(expert, learner)
+    free = build_arm(dataclasses.replace(env.expert, home=None), config.limits or "none").embodiment
+    for arm in (expert, learner) if config.hand != "scaled" else ():
+        if not len(arm.hand_joint):
+            raise ValueError(
+                f"expected arms whose hand is known, got {arm.name}; env.ROLE.hand= names its frame, and hand=scaled "
+                "needs none"
+            )
+    data = read_data_set(
+        Path(config.source).expanduser(), free, joints=config.joints, topic=config.topic, units=config.units,
+        rate=config.rate, joint_range=expert.joint_range,
+    )  # fmt: skip
+    dt = float(np.median(np.concatenate([np.diff(motion.time) for motion in data.measured.values()])))
+    shapes = _shapes(env.learner, env.limits)
+    config.costs.check_capsules(shapes[0])
+    grippers = (gripper_range(env.expert), gripper_range(env.learner)) if data.grippers else (None, None)
+    setting = _Setting(
+        expert, learner, env.metric, config.hand, config.placement, dt, config.seed, grippers,
+        mapped_grippers(data, grippers), config.costs, *shapes,
+    )  # fmt: skip
 
-    def run() -> None:
+    def run() -> int:
         console = Console()
-        with console.status(f"retargeting {demonstrations.count} motions from {expert.name} to {learner.name}"):
-            options = {"mapper": mapper, "seed": config.seed, "costs": config.costs, "capsules": capsules}
-            motions, report = retarget(demonstrations, expert, learner, env.metric, **options)
-        motions.save(out)
-        console.print(_table(motions, report))
-        console.print(similarity_table(report["similarity"]))
+        _print_lines(console, [note for note in data.notes if note.startswith(_WARNING)])
+        used = _with_base(setting, config.base, data, console)
+        motions: dict[str, dict[str, Motion]] = {entry: {} for entry in data.motions}
+        certificates = {}
+        with console.status(f"retargeting {len(data.measured)} episodes to {learner.name}") as status:
+            for number, (name, (found, certificate)) in enumerate(_retargeted(data, used), start=1):
+                status.update(f"retargeting to {learner.name}: {number} of {len(data.measured)} episodes")
+                certificates[name] = certificate
+                for entry, motion in found.items():
+                    motions[entry][name] = motion
+        kept = [name for name, item in certificates.items() if item.is_ok or config.failing == "kept"]
+        if not kept:
+            _print(console, data, certificates, kept, used, ())
+            print("error: no episode to write; failing=kept writes those that fail too", file=sys.stderr)
+            return 1
+        with written_atomically(out) as folder:
+            ranges, yaw = np.asarray(learner.joint_range, float), used.base[3] if used.base else 0.0
+            lines = write_data_set(data, folder, learner, motions, kept, ranges, yaw)
+            report = _report(data, certificates, kept, used, config)
+            write_atomically(folder / _REPORT, json.dumps(finite(report), indent=2) + "\n")
+            save_motions(folder, (expert, learner), data.measured, motions[data.entry], used.base)
+            plot_certificates(certificates, dt, folder / _PICTURE, f"{expert.name} to {learner.name}, {data.path.name}")
+        _print(console, data, certificates, kept, used, lines)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
+        return 0
 
     return run
 
 
-def check_poses(demonstrations: Demonstrations, arm: Embodiment) -> None:
-    """Raises a `ValueError` for demonstrations of another arm, and for poses outside its joint range.
+def _retargeted(data: DataSet, setting: _Setting) -> Iterator[tuple[str, tuple[dict[str, Motion], Certificate]]]:
+    """Each episode's name, motions and certificate, by groups of episodes."""
+    names, at_once = list(data.measured), _AT_ONCE["cpu" if compat.is_cpu() else "gpu"]
+    ends = np.cumsum([len(data.measured[name].time) for name in names])
+    for _, group in itertools.groupby(zip(names, ends, strict=True), key=lambda item: (item[1] - 1) // at_once):
+        yield from retarget_episodes(data, [name for name, _ in group], setting).items()
 
-    Joints that turn freely have none.
+
+def retarget_episodes(
+    data: DataSet, names: Sequence[str], setting: _Setting
+) -> dict[str, tuple[dict[str, Motion], Certificate]]:
+    """The learner's motions of episodes by entry, and the certificates of the measured ones.
+
+    Episodes of which few frames fail are searched again from other random poses; the motion with the fewest counts.
+    Commands are retargeted with the measured motion, as one path there and back, so that both have one posture and
+    the lag between them stays.
     """
-    demonstrations.check_fits(arm, demonstrations.dt, demonstrations.horizon)
-    lower, upper = pose_limits(arm, float)
-    outside = (demonstrations.qpos < lower - 1e-6) | (demonstrations.qpos > upper + 1e-6)
-    if outside.any():
-        demonstration, sample, joint = np.argwhere(outside)[0]
-        raise ValueError(
-            f"demonstrations: {arm.joint_names[joint]} of demonstration {demonstration} is at "
-            f"{demonstrations.qpos[demonstration, sample, joint]:.4f} rad at sample {sample}, outside its range "
-            f"[{lower[joint]:.4f}, {upper[joint]:.4f}]"
+    best = dict(zip(names, _retarget_from(data, names, setting), strict=True))
+    again = list(names)
+    for attempt in range(1, _ATTEMPTS):
+        again = [name for name in again if 0 < np.mean(np.array(best[name][1].causes) != "") < _FEW]
+        if not again:
+            break
+        others = _retarget_from(data, again, setting._replace(seed=setting.seed + attempt))
+        for name, other in zip(again, others, strict=True):
+            if sum(map(bool, other[1].causes)) < sum(map(bool, best[name][1].causes)):
+                best[name] = other
+    return best
+
+
+def _retarget_from(
+    data: DataSet, names: Sequence[str], setting: _Setting
+) -> Iterator[tuple[dict[str, Motion], Certificate]]:
+    """See `retarget_episodes`; from the random poses of one seed."""
+    jump = largest_jump(setting.learner, setting.dt)
+    paths = [
+        np.concatenate([motions[name].qpos[:: (-1) ** index] for index, motions in enumerate(data.motions.values())])
+        for name in names
+    ]
+    found = retarget_motions(
+        setting.expert, setting.learner, paths, setting.metric, hand=setting.hand, base=setting.base,
+        largest_jump=jump, seed=setting.seed, costs=setting.costs, capsules=setting.capsules,
+    )  # fmt: skip
+
+    def certified(name: str, path: np.ndarray) -> tuple[dict[str, Motion], Certificate]:
+        measured, motions = data.measured[name], {}
+        count = len(measured.time)
+        for index, entry in enumerate(data.motions):
+            qpos = path[index * count : (index + 1) * count][:: (-1) ** index]
+            qvel = np.gradient(qpos, measured.time, axis=0)
+            motions[entry] = Motion(measured.time, qpos, qvel, setting.openings[entry][name])
+        certificate = certify(
+            setting.expert, setting.learner, measured.qpos, motions[data.entry].qpos, jump,
+            base=setting.base, capsules=setting.capsules, contacts=setting.contacts,
+            demands_hand=setting.hand == "exact",
+        )  # fmt: skip
+        return motions, certificate
+
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as pool:
+        yield from pool.map(certified, names, found)
+
+
+def mapped_grippers(
+    data: DataSet, grippers: tuple[GripperRange | None, GripperRange | None]
+) -> dict[str, dict[str, np.ndarray | None]]:
+    """The gripper's values by entry and episode, as those of the learner's gripper where its range is another."""
+    openings = {}
+    for entry, motions in data.motions.items():
+        own: list[Any] = [motion.gripper for motion in motions.values()]
+        if all(gripper is not None for gripper in own):
+            (name, *_) = data.grippers.get(entry, ("", ()))[1] or ("",)
+            mapped = other_gripper(np.concatenate(own), *grippers, name)
+            if mapped is not None:
+                own = np.split(mapped, np.cumsum([len(gripper) for gripper in own])[:-1])
+        openings[entry] = dict(zip(motions, own, strict=True))
+    return openings
+
+
+def _shapes(arm: ArmConfig, limits: str) -> tuple[Capsules, Callable[..., Any]] | tuple[None, None]:
+    """Capsules around the links of an arm, and what tells contacts; None where it has no shapes."""
+    try:
+        return fit_capsules(arm, limits), make_contacts(arm, limits)
+    except ValueError:
+        return None, None
+
+
+def _with_base(setting: _Setting, base: Any, data: DataSet, console: Console) -> _Setting:
+    """The setting with the placement that is found for the data set, with base=auto."""
+    if base != "auto":
+        return setting
+    arguments = setting.metric.build(setting.expert, setting.learner).arguments
+    paths = [motion.qpos for motion in data.measured.values()]
+    with console.status("placing the base"):
+        found = find_base(
+            setting.expert, setting.learner, paths, largest_jump=largest_jump(setting.learner, setting.dt), **arguments
         )
+    return setting._replace(base=[round(float(number), 4) for number in found])
 
 
-def _table(motions: Demonstrations, report: Mapping[str, Any]) -> Table:
-    table = Table("", "value", title=f"{motions.count} motions of {motions.arm}", title_justify="left")
-    table.add_row("mean distance", f"{report['distance']:.4f}")
-    table.add_row("maximum jump of a joint", f"{report['largest_jump']:.3f} rad in {motions.dt} s")
-    table.add_row("poses at a minimum, or as proposed", f"{report['settled']:.1%}")
-    return table
+def _report(
+    data: DataSet,
+    certificates: Mapping[str, Certificate],
+    kept: Sequence[str],
+    setting: _Setting,
+    config: RetargetConfig,
+) -> dict[str, Any]:
+    rows = [{"episode": name, "written": name in kept, **item.summary()} for name, item in certificates.items()]
+    return {
+        "source": str(data.path),
+        "expert": setting.expert.name,
+        "learner": setting.learner.name,
+        "hand": setting.hand,
+        "base": setting.base or [0.0, 0.0, 0.0, 0.0],
+        "units": data.unit,
+        "measured": data.entry,
+        "commanded": list(data.commands),
+        "gripper": list(data.gripper),
+        "failing": config.failing,
+        "episodes": rows,
+        "not_retargeted": dict(data.faults),
+        "notes": list(data.notes),
+    }
+
+
+def _print(
+    console: Console,
+    data: DataSet,
+    certificates: Mapping[str, Certificate],
+    kept: Sequence[str],
+    setting: _Setting,
+    written: Sequence[str],
+) -> None:
+    """Prints the certificates, those that fail first, and lines about what was assumed, written and left out."""
+    title = f"{data.path.name}: {setting.expert.name} to {setting.learner.name}, hand={setting.hand}"
+    table = Table(title=title, title_justify="left")
+    for header in ("episode", "exact frames", "hand [mm]", "[deg]", "margin [deg]", "speed", "clearance [mm]"):
+        table.add_column(escape(header), justify="left" if header == "episode" else "right")
+    names = sorted(certificates, key=lambda name: certificates[name].is_ok)
+    for name in names[:_SHOWN]:
+        item = certificates[name]
+        clearance = item.clearance.min()
+        table.add_row(
+            name,
+            f"{item.is_exact.sum()} of {len(item.causes)}",
+            f"{1e3 * item.position.max():.2f}",
+            f"{np.degrees(item.rotation.max()):.2f}",
+            f"{np.degrees(item.margin.min()):.1f}",
+            f"{item.speed.max():.0%}",
+            "-" if np.isnan(clearance) else f"{1e3 * clearance:.0f}",
+        )
+    console.print(table)
+    lines = [f"episodes: {len(kept)} of {len(certificates) + len(data.faults)} are written"]
+    lines += [f"{len(names) - _SHOWN} more episodes in {_REPORT}"] if len(names) > _SHOWN else []
+    for name in [name for name in names if not certificates[name].is_ok][:_SHOWN]:
+        runs = list(certificates[name].failures())
+        first, last, cause = max(runs, key=lambda run: run[1] - run[0])
+        more = f", and {len(runs) - 1} more times" if len(runs) > 1 else ""
+        lines.append(f"{name} fails: {cause}, frames {first} to {last}{more}")
+    lines += [f"not retargeted: {name}: {fault}" for name, fault in list(data.faults.items())[:_SHOWN]]
+    base = setting.base or [0.0, 0.0, 0.0, 0.0]
+    lines.append(f"base of {setting.learner.name} in that of {setting.expert.name} [m, rad]: {base}")
+    lines += [note for note in data.notes if not note.startswith(_WARNING)]
+    lines += [f"commands: {', '.join(data.commands) or 'none'}"]
+    lines.append(_gripper_line(data, setting))
+    _print_lines(console, [*lines, *written, *filter(None, [_help_line(certificates, setting)])])
+
+
+def _print_lines(console: Console, lines: Sequence[str]) -> None:
+    for line in lines:
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+def _gripper_line(data: DataSet, setting: _Setting) -> str:
+    """What became of the gripper."""
+    if not data.gripper:
+        return "gripper: none"
+    name, motion = next(iter(data.measured.items()))
+    expert, learner = setting.grippers
+    if expert is None or learner is None or setting.openings[data.entry][name] is motion.gripper:
+        return f"gripper, as in the source: {', '.join(data.gripper)}"
+    ends = (
+        f"{', '.join(f'{x:.3g}' for x in end)}"
+        for end in (expert.closed, expert.opened, learner.closed, learner.opened)
+    )
+    return "gripper: closed at {}, open at {} becomes closed at {}, open at {}".format(*ends)
+
+
+def _help_line(certificates: Mapping[str, Certificate], setting: _Setting) -> str:
+    """What would help the episodes that fail; empty where none does."""
+    failing = [item for item in certificates.values() if not item.is_ok]
+    if not failing:
+        return ""
+    causes = " ".join(cause for item in failing for cause in item.causes)
+    wrong = [item.position[np.array([bool(cause) for cause in item.causes])] for item in failing]
+    advice = []
+    if "velocity limit" in causes:
+        advice.append("a slower source (velocity limits)")
+    if "out of reach" in causes or "range" in causes:
+        advice.append("another base (base=auto)" if setting.base is None else "another base (base=[x,y,z,yaw])")
+    if np.mean(np.concatenate(wrong) < 1e-3) > _POSITION_ALONE:
+        advice.append("the hand's position alone")
+    if "touch" in causes:
+        advice.append("a cost of touching (costs.self_collision=0.1)")
+    if "hand" in causes:
+        advice.append("hand=near, which takes the nearest hand")
+    return f"what would help: {'; '.join(advice)}" if advice else ""

@@ -1,5 +1,6 @@
 """Demonstrations: an expert's motions, saved in one npz file without pickle."""
 
+import contextlib
 import dataclasses
 import os
 from collections.abc import Sequence
@@ -207,6 +208,14 @@ def effective_rank(demonstrations: Demonstrations) -> float:
     values = np.linalg.svd(displacements.reshape(-1, demonstrations.horizon), compute_uv=False) ** 2
     fractions = values[values > 0] / values.sum()
     return float(np.exp(-np.sum(fractions * np.log(fractions))))
+
+
+def is_demonstrations(path: str | os.PathLike[str]) -> bool:
+    """Whether a path is that of a file in the format of `Demonstrations.save`."""
+    if os.fspath(path).endswith(".npz") and os.path.isfile(path):
+        with contextlib.suppress(ValueError):  # not an npz file
+            return str(read_arrays(path, ["format"]).get("format")) == FORMAT
+    return False
 
 
 def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.motions.cleaning import FULL_TURN, OVERSHOOT, Notes, cleaned
+from mimic.motions.demonstrations import Demonstrations, is_demonstrations, load_demonstrations
 from mimic.motions.doubts import doubts
 from mimic.motions.formats.episodes import Motion, Recording
 from mimic.motions.formats.hdf5 import is_hdf5
@@ -79,14 +80,19 @@ def read_data_set(
     """Reads the motions of an arm with all their samples; see `read_recording` for the arguments.
 
     An episode that would have to be repaired, such as one in which a joint jumps, has a fault. Angles beyond the
-    arm's own range are noted alone, since zeros of real arms are not quite those of their models.
+    arm's own range are noted alone, since zeros of real arms are not quite those of their models. A file of
+    demonstrations is read as it is.
 
     Raises:
-      ValueError: what `read_recording` rejects; all episodes have faults.
+      ValueError: what `read_recording` rejects; all episodes have faults; demonstrations of another arm.
     """
     names = source_names(arm, joints)
-    recording = read_source(path, names, topic, rate)
     ranges = np.asarray(arm.joint_range if joint_range is None else joint_range, float)
+    if is_demonstrations(path):
+        if joints or topic or units or rate:
+            raise ValueError("joints, topic, units, rate: expected none with a file of demonstrations, which has them")
+        return _demonstrations(path, arm)
+    recording = read_source(path, names, topic, rate)
     unit, line = find_unit(str(path), recording, arm.joint_names, ranges, units)
     entry = recording.entry
     recordings = {entry: recording} | {name: read_source(path, names, name, rate) for name in recording.commanded}
@@ -107,6 +113,19 @@ def read_data_set(
     notes = tuple(filter(None, (*recording.notes, line, *suspicious)))
     grippers = {name: (found.gripper_entry, found.gripper) for name, found in recordings.items() if found.gripper}
     return DataSet(path, entry, every, joint_names, faults, grippers, unit, rate is None, notes)
+
+
+def _demonstrations(path: Path, arm: Embodiment) -> DataSet:
+    """Demonstrations as a data set, one episode each."""
+    found = load_demonstrations(path)
+    found.check_fits(arm, found.dt, found.horizon)
+    time, grippers = found.dt * np.arange(found.horizon + 1), [None] * found.count
+    if found.gripper is not None:
+        grippers = list(found.gripper)
+    columns = zip(found.qpos, found.qvel, grippers, strict=True)
+    motions = {f"motion {number}": Motion(time, *column) for number, column in enumerate(columns)}
+    channels = {"qpos": ("qpos", found.gripper_names)} if found.gripper_names else {}
+    return DataSet(path, "qpos", {"qpos": motions}, {"qpos": arm.joint_names}, {}, channels, "rad", True, ())
 
 
 def _whole(recording: Recording, arm: Embodiment) -> tuple[dict[str, Motion], dict[str, str]]:
@@ -169,6 +188,10 @@ def write_data_set(
     Returns:
       Lines about what is left out or has another place.
     """
+    chosen = [motions[data.entry][name] for name in kept]
+    if is_demonstrations(data.path):
+        _write_demonstrations(out / data.path.name, data, learner, chosen)
+        return []
     in_unit = {
         entry: {name: from_rad(motion, data.unit, joint_range) for name, motion in found.items()}
         for entry, found in motions.items()
@@ -182,7 +205,6 @@ def write_data_set(
         lines = write(data.path, out, replacement)
         return [line if ":" in line else f"left out, as it is not known of {learner.name}: {line}" for line in lines]
     arrays = {"joint_names": np.array(learner.joint_names)}
-    chosen = [motions[data.entry][name] for name in kept]
     arrays["qpos"] = np.concatenate([motion.qpos for motion in chosen])
     arrays["qvel"] = np.concatenate([motion.qvel for motion in chosen])  # type: ignore[misc]
     arrays["split_points"] = np.cumsum([0, *(len(motion.time) for motion in chosen)])
@@ -198,6 +220,16 @@ def write_data_set(
     return [
         "format: mimic does not write this one again; the motions are in motions.npz, in rad and without other columns"
     ]
+
+
+def _write_demonstrations(path: Path, data: DataSet, learner: Embodiment, motions: Sequence[Motion]) -> None:
+    """Writes motions as demonstrations of the learner."""
+    qpos, qvel = (np.stack([getattr(motion, field) for motion in motions]) for field in ("qpos", "qvel"))
+    gripper = np.stack([motion.gripper for motion in motions]) if data.gripper else None  # type: ignore[arg-type]
+    dt = float(motions[0].time[1])
+    Demonstrations(
+        qpos, qvel, qpos[:, -1], dt, learner.name, learner.joint_names, gripper=gripper, gripper_names=data.gripper
+    ).save(path)
 
 
 def _writer(data: DataSet) -> Callable[[Path, Path, Replacement], list[str]] | None:

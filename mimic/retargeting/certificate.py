@@ -92,7 +92,7 @@ def certify(
     """Compares a motion of the learner with the expert's.
 
     Args:
-      expert, learner: arms with one hand each for every chain.
+      expert, learner: arms with one hand each for every chain; errors of the hands are NaN where an arm has none.
       expert_qpos: the expert's motion [rad].
       qpos: the learner's [rad].
       largest_jump: change of each joint at its velocity limit between two frames [rad].
@@ -139,6 +139,8 @@ def hand_errors(
     expert: Embodiment, learner: Embodiment, expert_qpos: np.ndarray, qpos: np.ndarray, base: Sequence[float] | None
 ) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]]:
     """Distances [m] and angles [rad] between the hands; of several hands the largest. See `certify`."""
+    if not (expert.hand_joint and learner.hand_joint):
+        return np.full(len(qpos), np.nan), np.full(len(qpos), np.nan)
     (hand, rotation), (own, own_rotation) = (
         by_chunks(_hands(arm), np.asarray(values, np.float32))
         for arm, values in ((expert, expert_qpos), (learner, qpos))

@@ -20,7 +20,7 @@ from mimic.retargeting.initial_guesses import random_poses
 from mimic.retargeting.pose import STARTS, PoseImitation, check_hand
 from mimic.retargeting.trajectory import imitate_trajectory
 
-_CHUNK = 256  # times
+_SHORTEST = 64  # times to which a motion is padded
 
 
 def largest_jump(arm: Embodiment, dt: float) -> Float[np.ndarray, " joints"]:
@@ -99,7 +99,8 @@ def retarget_motions(
             yield np.asarray(solution.qpos, float)
         return
     for qpos in motions:  # padded, so that motions of similar lengths share what is compiled
-        padded = qpos[np.minimum(np.arange(-(-len(qpos) // _CHUNK) * _CHUNK), len(qpos) - 1)]
+        length = max(_SHORTEST, 1 << (len(qpos) - 1).bit_length())
+        padded = qpos[np.minimum(np.arange(length), len(qpos) - 1)]
         solution = imitate_trajectory(
             expert, learner, jnp.asarray(padded, jnp.float32), largest_jump=largest_jump, key=key, costs=costs,
             capsules=capsules, **built.arguments,

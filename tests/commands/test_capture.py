@@ -9,9 +9,7 @@ import pytest
 import mimic
 from mimic.commands.capture import body_lines, read_arm, read_body
 from mimic.commands.config import CaptureConfig
-from mimic.commands.retarget import check_poses
-from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
-from mimic.motions.mocap.clips import slow_down_for, windows
+from mimic.motions.mocap.clips import slow_down_for
 from mimic.motions.mocap.link_motion import arm_motion
 from mimic.motions.mocap.picture import draw_skeleton
 from tests.helpers.bodies import bvh_text, person
@@ -141,19 +139,6 @@ def test_a_body_that_was_never_seen_whole_is_drawn(tmp_path):
     positions[:, body.names.index("Head")] = np.nan
     draw_skeleton(dataclasses.replace(body, positions=positions), tmp_path / "skeleton.png", "person")
     assert (tmp_path / "skeleton.png").stat().st_size > 10_000
-
-
-def test_angles_of_a_person_beyond_pi_are_retargeted(clip, tmp_path):
-    """The joints of a person turn freely; those of a robot with limits do not."""
-    capture = read_arm(clip, "right", CaptureConfig(trunk=0.0))
-    zero = zero_frames(capture.parts[0])
-    (tmp_path / "person.xml").write_text(ball_chain_xml(capture.parts[0], zero))
-    arm = mimic.load_mjcf(tmp_path / "person.xml")
-    cut = windows(capture.parts, zero, starts=capture.starts, dt=0.1, horizon=3).demonstrations
-    wound = dataclasses.replace(cut, qpos=cut.qpos + 2 * np.pi, arm=arm.name)
-    check_poses(wound, arm)
-    with pytest.raises(ValueError, match="outside its range"):
-        check_poses(wound, dataclasses.replace(arm, joint_range=0.5 * np.asarray(arm.joint_range)))
 
 
 def test_what_is_unusual_about_arms_is_named(tmp_path):

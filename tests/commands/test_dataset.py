@@ -14,7 +14,7 @@ import mimic
 from mimic.commands import dataset as command
 from mimic.commands.config import DatasetConfig
 from mimic.commands.dataset import prepare_dataset
-from mimic.commands.dataset_sources import file_episodes, rollout_episodes, steps_before_runaway
+from mimic.commands.dataset_sources import rollout_episodes, steps_before_runaway
 from mimic.envs.make import make_env
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.labels import SPLITS
@@ -175,22 +175,6 @@ def test_a_policys_motions_become_demonstrations(run_dir, written):
     np.testing.assert_allclose(of_expert.qpos, demonstrations.qpos, rtol=0, atol=1e-6)  # rad
 
 
-def test_retargeted_motions_have_both_arms(recorded, tmp_path):
-    expert = mimic.load_demonstrations(recorded)
-    names = tuple(name for name in expert.joint_names if name not in ("joint3", "joint6", "joint7"))
-    learner = dataclasses.replace(
-        expert, qpos=expert.qpos[..., :4], qvel=expert.qvel[..., :4], goals=expert.goals[:, :4], joint_names=names,
-        torque=None,
-    )  # fmt: skip
-    learner.save(tmp_path / "learner.npz")
-    write(tmp_path / "set", demonstrations=str(recorded), retargeted=str(tmp_path / "learner.npz"))
-    features = json.loads((tmp_path / "set/meta/info.json").read_text())["features"]
-    assert features["observation.state"]["shape"] == [8] and features["observation.environment_state"]["shape"] == [14]
-    assert features["action"]["names"] == [f"{name}.pos" for name in names]
-    with pytest.raises(ValueError, match="retargeted: expected 3 motions of 50 steps of 0.1 s, .* got 2 motions"):
-        file_episodes(expert, learner.select([0, 1]), "", {})
-
-
 def test_a_runaway_ends_an_episode():
     qvel = np.ones((4, 5, 2))
     qvel[1, 3, 0], qvel[2, 0, 1], qvel[3, 4] = 30.0, -40.0, np.nan
@@ -266,7 +250,6 @@ def test_a_missing_package_is_named(reason, recorded, monkeypatch, format, packa
         (["demonstrations=nothing.npz", "out=new"], "no file at 'nothing.npz'"),
         (["demonstrations={npz}", "out=new", "format=hdf5"], "format: expected one of lerobot, rosbag2, got 'hdf5'"),
         (["demonstrations={npz}", "out=new", "split=train"], "split: expected none without run="),
-        (["run={run}", "out=new", "retargeted={npz}"], "retargeted: expected none with run="),
         (["run={run}", "out=new", "checkpoint=5"], "checkpoint"),
     ],
 )

@@ -2,22 +2,24 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
 
 import mimic
-from mimic.arms.arm import build_arm
+from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.arms.rendering import ArmScene
 from mimic.commands import render
 from mimic.commands.clips import prepare_clip
 from mimic.commands.config import RenderConfig
 from mimic.commands.render import _write_video, draw_frames, prepare_video
+from mimic.commands.retargeted_motions import save_motions
 from mimic.envs import env_config
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line, similarity
-from mimic.motions.demonstrations import Demonstrations
+from mimic.motions.formats.episodes import Motion
 from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
 from mimic.motions.mocap.link_motion import LinkMotion
 
@@ -26,23 +28,24 @@ EVERY = 3  # frames from one sample to the next, 0.1 s at 30 frames a second
 ROUNDING = 1e-5  # of distances of about 1 in float32
 
 
-def swings(arm, count=2):
-    """Sinusoidal motions of an arm, with the velocities that belong to the angles."""
-    time = 0.1 * np.arange(STEPS + 1)[:, None]
-    phase = np.arange(count)[:, None, None] + np.arange(arm.num_joints)
-    qpos, qvel = 0.8 * np.sin(2 * time + phase), 1.6 * np.cos(2 * time + phase)
-    return Demonstrations(qpos, qvel, qpos[:, -1], 0.1, arm.name, arm.joint_names)
+def swings(arm):
+    """Sinusoidal motions of an arm."""
+    time = 0.1 * np.arange(STEPS + 1)
+    angles = (0.8 * np.sin(2 * time[:, None] + phase + np.arange(arm.num_joints)) for phase in range(2))
+    return {f"motion {phase}": Motion(time, qpos, None) for phase, qpos in enumerate(angles)}
+
+
+def saved(folder, arms) -> dict[str, Any]:
+    save_motions(folder, arms, swings(arms[0]), swings(arms[1]), None)
+    return {"retargeted": str(folder), "compilation_cache": ""}
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     """An expert's and a learner's motions, as keys of the command."""
-    folder = tmp_path_factory.mktemp("motions")
-    env = env_config("planar4dof")
-    arms = {"demonstrations": env.expert, "retargeted": env.learner}
-    for key, arm in arms.items():
-        swings(build_arm(arm).embodiment).save(folder / f"{key}.npz")
-    return {key: str(folder / f"{key}.npz") for key in arms} | {"learner": "planar4dof", "compilation_cache": ""}
+    arms = env_config("planar4dof").build_arms().embodiments
+    keys = saved(tmp_path_factory.mktemp("motions"), arms)
+    return keys | dict.fromkeys(("expert", "learner"), "planar4dof")
 
 
 @pytest.fixture(scope="module")
@@ -59,10 +62,10 @@ def curves(clip):
 @pytest.mark.slow
 def test_retargeted_motions_are_shown_as_they_are(plan):
     clip, env = plan.compute(), env_config("planar4dof")
-    arms = [build_arm(arm).embodiment for arm in (env.expert, env.learner)]
+    arms = env.build_arms().embodiments
     for shown, arm in zip(clip.poses, arms, strict=True):
         assert len(shown) == len(clip.time) == EVERY * STEPS + 1
-        np.testing.assert_allclose(shown[::EVERY], swings(arm).qpos[1], atol=1e-12)
+        np.testing.assert_allclose(shown[::EVERY], swings(arm)["motion 1"].qpos, atol=1e-12)
     shown = curves(clip)
     assert np.all(shown["optimal poses"] <= shown["retargeted"] + ROUNDING)
     assert clip.bars.shape == (len(clip.time), 4)
@@ -116,11 +119,10 @@ def test_a_video_that_lacks_frames_is_removed(tmp_path, monkeypatch, options):
     ("changes", "message"),
     [
         ({}, "out: expected a file, as in out=FILE.mp4"),
-        ({"learner": ""}, "learner: expected with retargeted=FILE"),
-        ({"learner": "planar7dof"}, "demonstrations: expected motions of planar4 .* got planar7"),
-        ({"learner": "planar5dof"}, "unknown environment 'planar5dof'"),
-        ({"demonstration": 2}, "demonstration: expected an index of the file from 0 to 1, got 2"),
-        ({"run": "runs/NAME"}, "run: expected none with retargeted=FILE"),
+        ({"learner": ""}, "learner: expected with retargeted=FOLDER"),
+        ({"expert": "planar7dof"}, "expert: expected the arm of the data set, .* got planar4 with"),
+        ({"demonstration": 2}, "demonstration: expected a number from 0 to 1, got 2"),
+        ({"run": "runs/NAME"}, "run: expected none with retargeted=FOLDER"),
     ],
 )
 def test_bad_files_are_rejected_in_one_line(files, changes, message):
@@ -129,18 +131,15 @@ def test_bad_files_are_rejected_in_one_line(files, changes, message):
     assert "\n" not in str(error.value)
 
 
-def test_motions_of_an_expert_from_a_file(files, tmp_path):
-    """As a person's: the environment's expert does not count."""
-    expert = mimic.env_config("planar4dof").build_arms().expert.embodiment
-    motion = LinkMotion(("a", "b"), (-1, 0), *_moving_links(), 10.0, "person")
-    (tmp_path / "person.xml").write_text(ball_chain_xml(motion, zero_frames(motion)))
-    person = mimic.load_mjcf(tmp_path / "person.xml")
-    assert person.num_joints == 6 != expert.num_joints
-    swings(person).save(tmp_path / "person.npz")
-    changed = {**files, "demonstrations": str(tmp_path / "person.npz")}
-    with pytest.raises(ValueError, match="demonstrations: expected motions of planar"):
-        prepare_clip(RenderConfig(**changed))
-    plan = prepare_clip(RenderConfig(**changed, expert=str(tmp_path / "person.xml")))
+@pytest.mark.parametrize("parents", [(-1, 0), (-1, -1)], ids=["one arm", "two arms"])
+def test_motions_of_an_expert_from_a_file(tmp_path, parents):
+    """As a person's, of one arm or of both."""
+    motion = LinkMotion(("a", "b"), parents, *_moving_links(), 10.0, "person")
+    model = tmp_path / "person.xml"
+    model.write_text(ball_chain_xml(motion, zero_frames(motion)))
+    person = mimic.load_mjcf(model, tip=[ALL_ENDS])
+    keys = saved(tmp_path, (person, mimic.panda()))
+    plan = prepare_clip(RenderConfig(**keys, expert=str(model), learner="panda"))
     assert plan.env.build_arms().expert.embodiment.joint_names == person.joint_names
 
 
@@ -149,13 +148,6 @@ def _moving_links():
     points = np.cumsum([[0, 0, 0], [0.3, 0, 0], [0.2, 0.1, 0]], axis=0) + np.zeros((5, 1, 1))
     points[:, 2, 2] = 0.02 * np.arange(5)
     return points[:, :-1], points[:, 1:]
-
-
-def test_motions_of_another_length_are_rejected(files, tmp_path):
-    learner = build_arm(env_config("planar4dof").learner).embodiment
-    swings(learner, count=1).save(tmp_path / "one.npz")
-    with pytest.raises(ValueError, match="expected 2 motions of 2 steps of 0.1 s, as in demonstrations, got 1 motions"):
-        prepare_clip(RenderConfig(**{**files, "retargeted": str(tmp_path / "one.npz")}))
 
 
 @pytest.mark.parametrize(

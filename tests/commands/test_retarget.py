@@ -3,16 +3,13 @@
 import dataclasses
 import json
 
-import jax
 import numpy as np
 import pytest
 
 import mimic
-from mimic.commands import retarget_data
-from mimic.commands.retarget import retarget
+from mimic.commands import retarget
 from mimic.retargeting.certificate import Certificate
-from mimic.trainers.config import PoseMapperConfig
-from mimic.trainers.pose_mapper.model import make_model
+from mimic.retargeting.motions import largest_jump, retarget_motions
 from tests.helpers.commands import run
 
 
@@ -25,51 +22,43 @@ def recorded(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_the_motions_load_and_do_not_jump(recorded, tmp_path):
-    out = tmp_path / "learner.npz"
-    assert "maximum jump" in run("retarget", f"demonstrations={recorded}", "env=planar4dof", f"out={out}")
-    motions = mimic.load_demonstrations(out)
+def test_demonstrations_become_those_of_the_learner(recorded, tmp_path):
+    out = tmp_path / "learner"
+    printed = run("retarget", f"source={recorded}", "env=planar4dof", "hand=scaled", f"out={out}")
+    assert "episodes: 3 of 3 are written" in printed
+    motions = mimic.load_demonstrations(out / recorded.name)
     env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
     motions.check_fits(env.learner, 0.1, 50)
-    assert motions.torque is None
+    assert motions.count == 3 and motions.torque is None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("with_mapper", [False, True], ids=["optimised", "mapped"])
-def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows(with_mapper):
+def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows():
     """The expert's poses are random, so that the learner would jump at each step; the last joint's limit is unknown."""
-    env, dt, rng = mimic.env_config("planar4dof"), 0.1, np.random.default_rng(0)
+    env, rng = mimic.env_config("planar4dof"), np.random.default_rng(0)
     expert, learner = (mimic.build_arm(arm).embodiment for arm in (env.expert, env.learner))
     learner = dataclasses.replace(learner, velocity_limit=np.array([0.5, 1.0, 2.0, np.inf]))
-    qpos = rng.uniform(-3, 3, (2, 8, expert.num_joints))
-    leaps = mimic.Demonstrations(qpos, 0 * qpos, qpos[:, -1], dt, expert.name, expert.joint_names)
-    model = make_model(env, PoseMapperConfig(hidden_layers=[16]).resolve())
-    mapper = mimic.PoseMapper(model, model.init(jax.random.key(0))) if with_mapper else None
-    motions, report = retarget(leaps, expert, learner, env.metric, mapper=mapper)
-    jumps, largest = np.abs(np.diff(motions.qpos, axis=1)), dt * np.array([0.5, 1.0, 2.0, np.pi])
+    largest, qpos = largest_jump(learner, 0.1), rng.uniform(-3, 3, (8, expert.num_joints))
+    np.testing.assert_allclose(largest, [0.05, 0.1, 0.2, 0.1 * np.pi])
+    (motion,) = retarget_motions(expert, learner, [qpos], env.metric, hand="scaled", largest_jump=largest)
+    jumps = np.abs(np.diff(motion, axis=0))
     assert np.all(jumps <= largest + 1e-6)  # float32, of angles up to 6 rad
-    assert np.all(jumps.max(axis=(0, 1)) > largest - 1e-6)  # each joint reaches its bound
-    assert report["largest_jump"] == jumps.max()
-    assert np.all(np.abs(motions.qvel) <= largest / dt)
+    assert np.all(jumps.max(axis=0) > largest - 1e-6)  # each joint reaches its bound
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["env=planar4dof"], "expected a data set or a file of demonstrations"),
-        (["source=none.csv", "demonstrations={recorded}"], "source: expected neither demonstrations= nor mapper="),
+        (["source={recorded}", "env=planar4dof", "out=new", "units=deg"], "joints, topic, units, rate: expected none"),
         (["source=none.csv", "hand=firm"], "hand: expected one of exact, near, scaled"),
         (["source=none.csv", "base=[1,2]"], "base: expected same, auto or [x,y,z,yaw], got [1, 2]"),
         (["source=none.csv", "failing=maybe"], "failing: expected one of left_out, kept"),
         (["source=none.csv", "out=new"], "source: no file at 'none.csv'"),
-        (["demonstrations={recorded}", "env=planar4dof"], "out: expected a file"),
-        (["demonstrations={recorded}", "learner=panda4dof", "out=new.npz"], "recorded with the joints"),
-        (
-            ["demonstrations={recorded}", "learner=pair", "out=new.npz"],
-            "learner: expected an arm, or an environment",
-        ),
-        (["demonstrations={recorded}", "env=planar4dof", "out={recorded}"], "exists; name a new file"),
-        (["demonstrations={recorded}", "env=planar4dof", "out=new.npz", "mapper=."], "not a run directory"),
+        (["source={recorded}", "env=planar4dof"], "out: expected a folder"),
+        (["source={recorded}", "learner=panda4dof", "out=new"], "recorded with the joints"),
+        (["source={recorded}", "learner=pair", "out=new"], "learner: expected an arm, or an environment"),
+        (["source={recorded}", "env=planar4dof", "out={recorded}"], "exists; name a new folder"),
     ],
 )
 def test_bad_input(reason, recorded, arguments, message):
@@ -113,9 +102,9 @@ def test_an_episode_of_which_few_frames_fail_is_searched_again(monkeypatch, fail
             none = np.zeros(100)
             yield setting.seed, Certificate(none, none, none, none, none, causes)
 
-    monkeypatch.setattr(retarget_data, "_retarget_from", of_seed)
-    setting = retarget_data._Setting(*[None] * 6, 0, *[None] * 5)  # type: ignore[arg-type]
-    found = retarget_data.retarget_episodes(None, ["hard", "easy"], setting)  # type: ignore[arg-type]
+    monkeypatch.setattr(retarget, "_retarget_from", of_seed)
+    setting = retarget._Setting(*[None] * 6, 0, *[None] * 5)  # type: ignore[arg-type]
+    found = retarget.retarget_episodes(None, ["hard", "easy"], setting)  # type: ignore[arg-type]
     assert found["easy"][0] == 0
     seed, certificate = found["hard"]
     assert seed == chosen

@@ -74,7 +74,7 @@ def test_a_damaged_array_is_one_line(folder, changes):
     ("changes", "message"),
     [
         ({"expert": ""}, "expert: expected with retargeted=FOLDER"),
-        ({"demonstrations": "d.npz"}, "demonstrations: expected none with retargeted=FOLDER"),
+        ({"locked": [3]}, "locked: expected none with retargeted=FOLDER"),
         ({"learner": "panda"}, "learner: expected the arm of the data set, with joints .*, got panda"),
     ],
 )

@@ -125,11 +125,12 @@ def test_pose_mapper(said, tmp_path):
     )
     assert mapper > optimiser
     names = "optimiser", "mapper", "zero pose"
-    distances = [number(rf"\n{name} +mean distance (\S+)", said) for name in names]
-    assert distances == sorted(distances)
-    for name in ("optimised", "mapped"):
-        motions = mimic.load_demonstrations(tmp_path / f"{name}.npz")
-        assert motions.joint_names == ("joint1", "joint2", "joint4", "joint5") and motions.count == 4
+    distances, steps = (
+        [number(rf"\n{name} +.*{what} (\S+)", said) for name in names] for what in ("distance", "step of a joint")
+    )
+    assert distances == sorted(distances) and steps[2] == 0 < steps[0] < steps[1]
+    motions = mimic.load_demonstrations(tmp_path / "optimised" / "expert.npz")
+    assert motions.joint_names == ("joint1", "joint2", "joint4", "joint5") and motions.count == 4
     assert is_picture(tmp_path / "retargeted.png")
 
 

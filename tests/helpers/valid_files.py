@@ -88,7 +88,7 @@ def write_command_lines(folder: Path) -> None:
         "train_mapper": f"{small} trainer=pose_mapper trainer.samples=64 trainer.epochs=2 trainer.learning_rate=1e-3",
         "evaluate": "run=run checkpoint=3 controller=policy physics=mjx mass=1.1 out=out",
         "render": "run=run demonstration=1 split=train",
-        "retarget": "demonstrations=d.npz learner=planar4dof limits=none out=o.npz seed=1",
+        "retarget": "source=d.npz learner=planar4dof limits=none hand=scaled out=o seed=1",
         "demonstrations": "env=planar4dof count=3 source=m.csv joints=[a,b] capture.cutoff=6 out=d.npz",
         "view": "env=pair expert=panda port=8080 host=127.0.0.1 split=train",
         "dataset": "run=run format=lerobot task=move out=out",

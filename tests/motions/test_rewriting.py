@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.motions.demonstrations import Demonstrations, load_demonstrations
 from mimic.motions.formats.episodes import Motion
 from mimic.motions.formats.replacing import replaced_columns
 from mimic.motions.importing import read_source
@@ -272,6 +273,24 @@ def test_an_npz_file(tmp_path):
         assert content["jnt_type"].tolist() == [0, 3, 3, 3, 3, 2]
         assert content["qpos"][0, 0] == COUNTS[0]
         assert content["label"] == "kept"
+
+
+@pytest.mark.parametrize("has_gripper", [False, True])
+def test_demonstrations_are_read_as_they_are(tmp_path, has_gripper):
+    """Also with angles beyond the arm's range and with jumps."""
+    qpos = np.random.default_rng(0).normal(scale=5, size=(2, 8, 3))
+    channels = {"gripper": qpos[..., :1], "gripper_names": ("jaw",)} if has_gripper else {}
+    Demonstrations(qpos, 0.1 * qpos, qpos[:, -1], 0.05, EXPERT.name, OLD, **channels).save(tmp_path / "in.npz")
+    data, motions, out, lines = rewrite(tmp_path, tmp_path / "in.npz", kept=[1])
+    for number, motion in enumerate(data.measured.values()):
+        np.testing.assert_array_equal(motion.qpos, qpos[number])
+        np.testing.assert_allclose(motion.time, 0.05 * np.arange(8))
+    assert not data.faults and not data.notes and not lines
+    written = load_demonstrations(out / "in.npz")
+    assert (written.arm, written.joint_names, written.dt, written.count) == ("learner", NEW, 0.05, 1)
+    np.testing.assert_array_equal(written.qpos[0], motions["qpos"]["motion 1"].qpos)
+    np.testing.assert_array_equal(written.qvel[0], motions["qpos"]["motion 1"].qvel)
+    assert (written.gripper is not None) == has_gripper and written.gripper_names == data.gripper
 
 
 def test_an_episode_that_needs_repair_is_a_fault(tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.arms.embodiment import without_hands
 from mimic.retargeting.certificate import certify, hand_errors
 
 ARM = dataclasses.replace(mimic.panda(), joint_range=np.array([[-3.0, 3.0]] * 7))
@@ -28,6 +29,11 @@ def test_the_same_motion_is_exact():
     assert summary["largest_error_deg"] < 1e-3
     assert summary["largest_speed"] == pytest.approx(2 * 0.5 / 19 / 0.1)
     assert summary["smallest_margin_deg"] == pytest.approx(np.degrees(3 - QPOS.max()), rel=1e-6)
+
+
+def test_errors_of_hands_that_an_arm_has_not_are_unknown():
+    certificate = certify(ARM, without_hands(ARM), QPOS, QPOS, JUMP, demands_hand=False)
+    assert certificate.is_ok and np.isnan(certificate.position).all() and not certificate.is_exact.any()
 
 
 def test_the_hand_errors_are_those_of_a_rotation_of_the_last_joint():

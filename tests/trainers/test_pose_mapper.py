@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.commands import retarget
-from mimic.commands.config import EvaluateConfig, RetargetConfig
+from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs import env_config
 from mimic.runs.checkpoints import checkpoint_steps
@@ -111,24 +110,6 @@ def test_the_nearest_head_is_taken(trained):
     candidates = jax.jit(mapper.candidates)(qpos)
     distances = jax.jit(jax.vmap(mapper.distance, (None, 0)))(qpos, candidates)
     np.testing.assert_allclose(jax.jit(mapper)(qpos), candidates[int(np.argmin(distances))], atol=1e-6)
-
-
-@pytest.mark.slow
-def test_retargeted_motions_do_not_jump(learned, tmp_path):
-    mapper = mimic.PoseMapper.load(learned[0])
-    env = mimic.make("planar4dof", demonstrations={"count": 3, "held_out": 1})
-    out = tmp_path / "learner.npz"
-    env.demonstrations.save(tmp_path / "expert.npz")
-    config = RetargetConfig(
-        demonstrations=str(tmp_path / "expert.npz"), env=env.config, mapper=str(learned[0]), out=str(out)
-    )
-    retarget.prepare_retargeting(config)()
-    motions = mimic.load_demonstrations(out)
-    motions.check_fits(env.learner, 0.1, 50)
-    assert np.all(np.abs(np.diff(motions.qpos, axis=1)) <= env.learner.velocity_limit * 0.1 + 1e-5)
-    metric, arms = env.config.metric, (env.expert, env.learner)
-    mapped, optimised = (retarget.retarget(env.demonstrations, *arms, metric, mapper=way)[1] for way in (mapper, None))
-    assert optimised["distance"] < mapped["distance"] < optimised["distance"] + 0.05
 
 
 @pytest.mark.slow
