@@ -17,7 +17,7 @@ FOLDERS = (
 )
 # Benchmarks that measure up to a folder; all others measure trained policies, and so all folders.
 HIGHEST = {
-    **dict.fromkeys(("hands", "models"), "arms"),
+    "hands": "arms",
     "kernel": "metric",
     **dict.fromkeys(
         ("bound", "costs", "exact_hands", "pose", "similarity", "teleoperation", "transfer", "transfer_throughput"),
