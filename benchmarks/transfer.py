@@ -23,7 +23,9 @@ Frames that fail: in each run of them, the frame whose hand needs the fastest jo
 this hand, and `speed` is the least of them: of the fastest joint, as a fraction of its limit, with the best use of a
 redundant joint. Above 1, or without a posture, the hand cannot be exact there and at the next time from this base.
 
-In physics, `success` is robosuite's at the end. Beside mimic: seeded `ssik`, and `copied` joints, from the same base.
+In physics, `success` is robosuite's at the end; `exact` and `speed` are of what is commanded. Beside mimic, from the
+same base: the solution of `ssik` nearest to the last one, `mink`'s quadratic program from the last one, and `copied`
+joints.
 """
 
 import argparse
@@ -46,7 +48,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.common import measured_code
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
-from benchmarks.exact_hands import SPEEDS, all_postures, as_numbers, followed_by_ssik, homogeneous
+from benchmarks.exact_hands import SPEEDS, all_postures, as_numbers, followed_by_mink, followed_by_ssik, homogeneous
 from benchmarks.teleoperation import BASE, SPEED, arm, hand_errors, recordings
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.compile_check import VELOCITY_LIMIT
@@ -62,11 +64,11 @@ from mimic.retargeting.hand_speeds import hand_jacobians
 from mimic.retargeting.hand_target import placement
 
 ARMS = "ur5e", "iiwa14", "gen3", "jaco", "xarm7"
-METHODS = "mimic", "ssik", "copied"
+METHODS = "mimic", "ssik", "mink", "copied"
 TASKS = "lift", "stack", "nut-assembly", "pick-place", "door"
 PAIRS = "learner task frames exact mm:.3f deg:.3f speed:.2f margin_deg:.1f depth_mm:.1f gripper ok seconds:.0f"
 FAILING = "learner task first last frame postures speed:.2f"
-PHYSICS = "learner task method success objects tracking_error_rad:.3f"
+PHYSICS = "learner task method success objects exact:.1% speed:.1f tracking_error_rad:.3f"
 TELEOPERATION = "method episodes frames position_mm_p50:.1f position_mm_p95:.1f hand_direction_deg:.2f"
 _SITE, _EPISODE = "gripper0_right_grip_site", "data/demo_1"
 _WITHOUT_REDUNDANCY = 6  # joints
@@ -285,21 +287,25 @@ def teleoperation(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def in_physics(options: argparse.Namespace, expert: Model, method: str, row: Row) -> list[Row]:
-    """Task success of an arm's motion by a method: the Panda's own, mimic's, copied joints or those of seeded ssik."""
+    """Task success of an arm's motion by a method: the Panda's own, mimic's, copied joints or those of seeded IK."""
     work, name, task = Path(options.work).absolute(), row["learner"], row["task"]
     arm = build_arm(ArmConfig(model=str(with_speeds(options.folder, name))), "hardware").embodiment
     folder, path = Path(options.demonstrations).absolute() / task, work / f"{task}_{name}_{method}.npy"
     with h5py.File(folder / "demo.hdf5") as file:
-        qpos = np.asarray(file[f"{_EPISODE}/states"], float)[:, 1:8]
+        states = np.asarray(file[f"{_EPISODE}/states"], float)
+    qpos, learner = states[:, 1:8], Model(Path(options.folder) / name / f"{name}.xml")
+    hands = targets(expert, qpos, row["base"])
     if method == "mimic":
         qpos = np.load(work / f"{task}_{name}.npy")
-    elif method == "ssik":
-        learner = Model(Path(options.folder) / name / f"{name}.xml")
-        hands = of_arm(arm, learner, targets(expert, qpos, row["base"]))
-        qpos = followed_by_ssik(arm, hands, np.asarray(arm.home, float))
+    elif method in ("ssik", "mink"):
+        own = of_arm(arm, learner, hands)
+        start = followed_by_ssik(arm, own[:1], np.asarray(arm.home, float))[0]
+        qpos = {"ssik": followed_by_ssik, "mink": followed_by_mink}[method](arm, own, start)
     elif method == "copied":
         qpos = np.clip(qpos[:, : arm.num_joints], *arm.joint_range.T)
     np.save(path, qpos)
+    checked = check(learner, qpos, hands, float(np.median(np.diff(states[:, 0]))), SPEEDS[name])
+    of_motion = {"exact": checked["exact"] / len(qpos), "speed": checked["speed"]}
     frames = [len(qpos) // 2, len(qpos) - 1] if method == "mimic" else []
     job = {"task": task, "robot": name, "method": method, "base": row["base"], "motion": str(path)}
     files = [work / f"{kind}_{task}_{name}_{method}.json" for kind in ("jobs", "replays")]
@@ -309,7 +315,8 @@ def in_physics(options: argparse.Namespace, expert: Model, method: str, row: Row
     subprocess.run([options.physics, str(script), "replay", *map(str, files)], check=True, env=environment)
     keys = "task", "method", "success", "ever", "objects", "tracking_error_rad"
     results = json.loads(files[1].read_text())
-    return [{"learner": result["robot"], **{key: result[key] for key in keys}} for result in results]
+    rows = ({"learner": result["robot"], **{key: result[key] for key in keys}, **of_motion} for result in results)
+    return [as_numbers(row) for row in rows]
 
 
 def kept(options: argparse.Namespace, path: Path, measure: Callable[[], Any]) -> Any:

@@ -203,7 +203,7 @@ def captured_policies(results: Results) -> list[Cells]:
 
 def transfers(results: Results) -> list[Cells]:
     """Demonstrations on each arm: how many keep all hands, and how many succeed in robosuite by each method."""
-    titles = {"mimic": "succeed in robosuite", "ssik": "ssik", "copied": "joints copied"}
+    titles = {"mimic": "succeed in robosuite", "ssik": "ssik", "mink": "mink", "copied": "joints copied"}
     methods = [method for method in titles if where(results["physics"], method=method)]
     rows: list[Cells] = [("arm", "exact in all frames", "frames", *(titles[method] for method in methods))]
     learners = list(dict.fromkeys(row["learner"] for row in results["pairs"]))
