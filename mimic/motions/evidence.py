@@ -21,6 +21,7 @@ _LAGS = 0.0, 0.05, 0.1, 0.2, 0.3, 0.5  # s, of measured angles behind commands
 _SHORT_PATH, _FITS = 0.03, 5.0  # m, mm: a path of the hand that says nothing, and an error that is none
 _FIT_STEPS, _TOOL_STIFFNESS = 8, 0.02  # Gauss-Newton; the tool's offset must not explain all
 _STEP_LAG, _UNCORRELATED = 1, 0.4  # samples from a commanded step of the hand; 1 minus the correlation
+_PRESSES = 0.5  # of the median over axes: the hand's steps for commanded ones, where something holds it
 
 
 class Evidence(NamedTuple):
@@ -163,16 +164,21 @@ def _of_hands(arm: Embodiment, qpos: np.ndarray, hand: np.ndarray) -> Evidence:
 
 
 def _of_hand_steps(arm: Embodiment, samples: Samples, steps: np.ndarray) -> Evidence:
-    """1 minus the correlation of the hand's steps with commanded ones, in the axes of the base."""
+    """1 minus the correlation of the hand's steps with commanded ones, in the axes of the base.
+
+    An axis in which the hand hardly moves for its commands does not count: it may press on something, as on a table.
+    """
     first = np.minimum(samples.rows + _STEP_LAG, samples.ends - 1)
     stated = steps[samples.rows]
 
     def errors(qpos: np.ndarray) -> np.ndarray:
         position, _ = hand_points(arm, qpos)
         step = position[:, len(first) :] - position[:, : len(first)]
-        product = np.sum(step * stated, axis=(1, 2))
-        norms = np.sqrt(np.sum(step**2, axis=(1, 2)) * np.sum(stated**2))
-        return (1 - product / np.maximum(norms, 1e-12))[:, None]
+        products, squares, commanded = np.sum(step * stated, axis=1), np.sum(step**2, axis=1), np.sum(stated**2, axis=0)
+        gain = np.sqrt(squares / np.maximum(commanded, 1e-12))
+        counts = gain >= _PRESSES * np.median(gain, axis=1, keepdims=True)
+        norms = np.sqrt(np.sum(counts * squares, axis=1) * np.sum(counts * commanded, axis=1))
+        return (1 - np.sum(counts * products, axis=1) / np.maximum(norms, 1e-12))[:, None]
 
     rows = np.concatenate([samples.qpos[first], samples.qpos[first + 1]])
     return Evidence(

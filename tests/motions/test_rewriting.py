@@ -8,10 +8,12 @@ import pytest
 
 import mimic
 from mimic.motions.demonstrations import Demonstrations, load_demonstrations
+from mimic.motions.evidence import _of_hand_steps, hand_points, samples_of
 from mimic.motions.formats.episodes import Motion
 from mimic.motions.formats.replacing import replaced_columns
 from mimic.motions.importing import read_source
 from mimic.motions.rewriting import read_data_set, write_data_set
+from tests.helpers.real_data import ROBOSUITE, needs
 
 EXPERT = dataclasses.replace(mimic.planar_arm([0.3, 0.3, 0.2]), joint_range=np.array([[-2.0, 2.0]] * 3))
 LEARNER = dataclasses.replace(
@@ -232,6 +234,28 @@ def test_commanded_steps_of_the_hand_are_in_the_axes_of_the_learners_base(tmp_pa
     np.testing.assert_allclose(written[:, :3] @ turn.T, steps[:, :3], atol=1e-12)
     np.testing.assert_allclose(written[:, 3:6] @ turn.T, steps[:, 3:6], atol=1e-12)
     np.testing.assert_array_equal(written[:, 6], steps[:, 6])
+
+
+def test_a_hand_that_presses_fits_its_commanded_steps_and_another_arm_does_not():
+    """Commands along z press on a table, so that the hand of the right arm moves in the plane alone."""
+    arm, time = mimic.panda(), np.arange(200) / RATE
+    qpos = np.array(arm.home) + 0.3 * np.sin(time[:, None] * np.linspace(0.7, 1.9, 7))
+    samples = samples_of({"a": Motion(time, qpos, None)})
+    hand, _ = hand_points(arm, qpos)
+    steps = np.vstack([np.zeros((1, 3)), np.diff(hand, axis=0)[1:], np.zeros((1, 3))])  # each a sample ahead
+    steps[:, 2] = 2 * np.abs(steps).max() * np.where(np.arange(len(steps)) % 9 < 4, 1, -1)
+    evidence = _of_hand_steps(arm, samples, np.roll(steps, -1, axis=0))
+    negated = evidence.rows * [1, -1, 1, 1, 1, 1, 1]
+    right, wrong = evidence.errors(np.stack([evidence.rows, negated]))[:, 0]
+    assert right < evidence.tolerance / 2
+    assert wrong > evidence.tolerance
+
+
+@needs(ROBOSUITE)
+def test_a_recorded_hand_that_wipes_a_table_has_no_warning():
+    pytest.importorskip("h5py")
+    data = read_data_set(ROBOSUITE / "wipe/demo.hdf5", mimic.panda())
+    assert not [note for note in data.notes if note.startswith("warning")]
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
