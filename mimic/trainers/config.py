@@ -29,7 +29,7 @@ NETWORKS = ("mlp", "joints")
 LOOPS = ("mimic", "brax")
 # Settings that brax's loop lacks, with the values by which ours has none of them either.
 _WITHOUT_SCHEDULES = {"final_learning_rate": 1.0, "final_entropy_cost": 1.0, "privileged_critic": False}
-LOGGERS = ("local", "wandb", "mlflow")
+LOGGERS = ("local", "wandb")
 
 # Factor on the number of evaluations with a target gap, so that training ends soon after the gap is reached: an
 # evaluation takes less time than the steps between two evaluations.
@@ -339,8 +339,7 @@ class TrainConfig:
       run_dir: folder that the run writes to; runs/ENV-TRAINER-seedSEED-TIME where empty.
       resume: run directory of the run to continue.
       init: run directory of another run; training starts from the parameters of its last checkpoint.
-      logger: "local", "wandb", "mlflow", or a list of these: services that metrics are sent to. The run directory
-        always has the metrics.
+      logger: "local" for the run directory alone, or "wandb": Weights & Biases gets the metrics too.
       compilation_cache: folder where JAX keeps compiled functions between runs; none where empty.
       distributed: see `DistributedConfig`.
     """
@@ -351,19 +350,13 @@ class TrainConfig:
     run_dir: str = ""
     resume: str = ""
     init: str = ""
-    logger: Any = "local"
+    logger: str = "local"
     compilation_cache: str = "~/.cache/mimic/jax"
     distributed: DistributedConfig = dataclasses.field(default_factory=DistributedConfig)
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        for name in self.loggers:
-            check_choice("logger", name, LOGGERS)
-
-    @property
-    def loggers(self) -> list[str]:
-        """The names in `logger` as a list."""
-        return [self.logger] if isinstance(self.logger, str) else list(map(str, self.logger or ()))
+        check_choice("logger", self.logger, LOGGERS)
 
     def resolve(self, backend: str = "cpu", devices: int = 1) -> Self:
         """The config with a resolved trainer, see `TrainerConfig.resolve`."""

@@ -28,7 +28,7 @@ from mimic.runs.divergence import EXIT_CODE as DIVERGED
 from mimic.runs.divergence import Diverged
 from mimic.runs.files import CONFIG, reported_steps, write_report
 from mimic.runs.lock import RunLock
-from mimic.runs.loggers import check_loggers, make_loggers
+from mimic.runs.loggers import WandbLogger, wandb_package
 from mimic.runs.metrics_log import MetricsLog
 from mimic.runs.provenance import hardware
 from mimic.runs.signals import Interrupted, Signals, noted_signals
@@ -97,7 +97,8 @@ def prepare_training(
     is_first = group is None or group.first
     if not resumed_dir:
         config.check_used()
-    check_loggers(config.loggers)
+    if config.logger == "wandb":
+        wandb_package()
     run_dir = resumed_dir or (new_run_dir(config) if is_first else Path())
     lock = RunLock(run_dir) if resumed_dir and is_first else None  # before its checkpoints are read
     own_arms(config.env)  # rejects names that the run directory could not keep
@@ -333,7 +334,9 @@ def _train_and_log(
     delete_partial_checkpoints(run_dir)
     mark_damaged_after(run_dir, resumed_step)
     with contextlib.ExitStack() as stack:
-        loggers = [MetricsLog(run_dir, first_step), *make_loggers(config.loggers, run_dir, to_dict(config))]
+        loggers: list[MetricsLog | WandbLogger] = [MetricsLog(run_dir, first_step)]
+        if config.logger == "wandb":
+            loggers.append(WandbLogger(run_dir, to_dict(config)))
         for logger in loggers:
             stack.callback(logger.close)  # also where training is interrupted
         progress = stack.enter_context(TrainingProgress(console, trainer.total_steps, resumed_step))
