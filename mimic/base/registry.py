@@ -118,11 +118,6 @@ def check(kind: str, name: str, key: str) -> None:
     )
 
 
-def origin(kind: str, name: str) -> str:
-    """The plugin or module that a registered thing is from."""
-    return _registered[kind][name].origin
-
-
 def load_plugin(plugin: str) -> None:
     """Imports a module, which registers things. Processes started later do the same.
 

@@ -10,7 +10,6 @@ from mimic.runs.provenance import hardware, versions
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.progress import report_table, similarity_table
-from mimic.trainers.run_plugins import used_plugins
 from mimic.trainers.trainer import Trainer
 
 
@@ -45,5 +44,4 @@ def make_report(
         "steps_per_second": trained / wall_time["train"] if wall_time["train"] else 0.0,
         "hardware": hardware(),
         "versions": versions(),
-        **({"plugins": used} if (used := used_plugins(config)) else {}),
     }

@@ -17,7 +17,6 @@ from mimic.runs.files import CONFIG, DEMONSTRATIONS
 from mimic.runs.lock import LOCK
 from mimic.trainers.config import PPOConfig, TrainConfig, trainer_config
 from mimic.trainers.run_models import MODELS, with_original_models, with_saved_models
-from mimic.trainers.run_plugins import PLUGINS, check_plugins
 
 
 def new_run_dir(config: TrainConfig) -> Path:
@@ -41,7 +40,7 @@ def new_run_dir(config: TrainConfig) -> Path:
 
 def check_new_run(path: Path) -> None:
     """Raises a `ValueError` if a path exists, unless it is a folder of a run that ended before it wrote its config."""
-    inputs = DEMONSTRATIONS, MODELS, PLUGINS
+    inputs = DEMONSTRATIONS, MODELS
     before_config = {LOCK, *inputs, *(f"{name}.partial" for name in (*inputs, CONFIG))}
     if not (os.path.isdir(path) and {file.name for file in path.iterdir()} <= before_config):
         check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
@@ -89,7 +88,6 @@ def load_config(run_dir: Path, *, saved_models: bool = True) -> TrainConfig:
 def _read_config(run_dir: Path) -> TrainConfig:
     if not (run_dir / CONFIG).is_file():
         raise ValueError(f"{str(run_dir)!r} is not a run directory: it has no {CONFIG}")
-    check_plugins(run_dir)
     try:
         content = read_config(run_dir / CONFIG)
         check_references(content)  # before anything resolves them

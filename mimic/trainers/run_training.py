@@ -47,7 +47,6 @@ from mimic.trainers.run_config import (
     save_config,
 )
 from mimic.trainers.run_models import own_arms, save_models
-from mimic.trainers.run_plugins import save_plugins
 from mimic.trainers.trainer import Params, Trainer
 
 FAILED, BAD_INPUT = 1, 2  # exit codes
@@ -246,7 +245,6 @@ def run_training(
     """
     with contextlib.closing(lock or _new_run(run_dir, trainer)):
         save_models(run_dir, config.env)
-        save_plugins(run_dir, config)
         save_config(run_dir, config)  # after the inputs: a folder without it is no run yet
         headline = f"{trainer.headline} on {hardware()['device']} (preset {trainer.settings.preset})"
         lines = filter(None, (headline, trainer.simulation, f"run directory: {run_dir}"))

@@ -81,7 +81,7 @@ def test_a_package_registers_by_its_entry_point(own_registry, monkeypatch, capsy
     monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: {"mimic.plugins": [Broken(), Entry()]}[group])
     for _ in range(2):
         assert MetricConfig(correspondence="double").correspondence == "double"
-    assert calls == [1] and own_registry.origin("correspondence", "double") == "package_of_arms"
+    assert calls == [1] and own_registry._registered["correspondence"]["double"].origin == "package_of_arms"
     assert capsys.readouterr().err == "warning: plugin 'broken' of broken_package failed: ImportError: no such thing\n"
 
 
@@ -94,7 +94,7 @@ def test_a_config_imports_nothing(module):
 def test_a_plugin_is_imported_and_named_for_other_processes(module, own_registry):
     assert load_plugins(["--plugin", "own_terms", "seed=1"]) == ["seed=1"]
     assert own_registry.names("correspondence") == ("own",) and module == [1]
-    assert own_registry.origin("correspondence", "own") == "own_terms"
+    assert own_registry._registered["correspondence"]["own"].origin == "own_terms"
     assert os.environ[own_registry.VARIABLE] == "own_terms"
 
 
