@@ -20,7 +20,7 @@ HIGHEST = {
     "hands": "arms",
     "kernel": "metric",
     **dict.fromkeys(
-        ("bound", "costs", "exact_hands", "pose", "similarity", "teleoperation", "transfer", "transfer_throughput"),
+        ("bound", "exact_hands", "pose", "similarity", "teleoperation", "transfer", "transfer_throughput"),
         "retargeting",
     ),
     "physics": "envs",

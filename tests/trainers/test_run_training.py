@@ -304,15 +304,6 @@ def test_a_training_that_diverges_stops_and_keeps_its_checkpoints(finished, tmp_
     assert checkpoint_steps(run_dir) == [0] and not (run_dir / "report.json").exists()
 
 
-@pytest.mark.slow
-def test_training_ends_at_the_target_gap(tmp_path):
-    run_dir = tmp_path / "early"
-    result = command("train", *TINY, f"run_dir={run_dir}", "trainer.target_gap=100")
-    assert result.returncode == 0, result.stderr[-2000:]
-    assert len((run_dir / "metrics.csv").read_text().splitlines()) == 1 + 1
-    assert json.loads((run_dir / "report.json").read_text())["env_steps"] < 5000
-
-
 ENDLESS = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"
 
 
