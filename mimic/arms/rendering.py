@@ -86,15 +86,21 @@ class ArmScene:
         self._aspect, self._centres = width / height, [0.0] * len(arms)
         self._renderer = new_renderer(self._model, width, height, fast)
 
-    def fit(self, poses: Sequence[Float[np.ndarray, "frames joints"]]) -> None:
+    def fit(
+        self,
+        poses: Sequence[Float[np.ndarray, "frames joints"]],
+        others: Sequence[Float[np.ndarray, "points 3"]] | None = None,
+    ) -> None:
         """Moves arms and camera so that the arms fill the image in all these poses [rad], those of each arm in turn.
 
-        The floor is at the bases, or below the lowest link where an arm reaches below its base, as a person's does.
+        So do other points beside each arm, in its base frame [m]. The floor is at the bases, or below the lowest link
+        where an arm reaches below its base, as a person's does.
         """
         margin = MARGIN * max(float(arm.chain_length) for arm in self._arms)
+        others = [np.zeros((0, 3))] * len(poses) if others is None else others
         points = [
-            np.concatenate([base[:3, 3][None], _points(arm, arm_poses) @ base[:3, :3].T + base[:3, 3]])
-            for arm, base, arm_poses in zip(self._arms, self._bases, poses, strict=True)
+            np.concatenate([np.zeros((1, 3)), _points(arm, arm_poses), others_of_arm]) @ base[:3, :3].T + base[:3, 3]
+            for arm, base, arm_poses, others_of_arm in zip(self._arms, self._bases, poses, others, strict=True)
         ]
         sizes = np.array([np.ptp(self.flattened(arm_points), axis=0) for arm_points in points])
         room = self._aspect * (sizes[:, 1].max() + 2 * margin) - sizes[:, 0].sum() - 2 * margin
@@ -137,9 +143,12 @@ class ArmScene:
         self._camera.distance = half_height / np.tan(half_angle) + depth.mean() - depth.min()
 
     def image(
-        self, poses: Sequence[Float[np.ndarray, " joints"]], overlay: Sequence[Capsule] = ()
+        self,
+        poses: Sequence[Float[np.ndarray, " joints"]],
+        overlay: Sequence[Capsule] = (),
+        at_first: Sequence[Capsule] = (),
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """Renders the arms in these poses [rad], and an overlay at the last arm, as of `LinkMatch.ghost`."""
+        """Renders the arms in these poses [rad], overlays at the last arm, as of `LinkMatch.ghost`, and the first."""
         for name, angle in self._locked.items():
             self._data.joint(name).qpos[0] = angle
         for names, pose in zip(self._joints, poses, strict=True):
@@ -148,8 +157,9 @@ class ArmScene:
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         self._renderer.update_scene(self._data, self._camera)
-        for capsule in overlay:
-            _add_capsule(self._renderer.scene, capsule, self._bases[-1])
+        for base, capsules in ((self._bases[-1], overlay), (self._bases[0], at_first)):
+            for capsule in capsules:
+                _add_capsule(self._renderer.scene, capsule, base)
         return self._renderer.render()
 
     def flattened(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:

@@ -55,6 +55,7 @@ class Clip:
       similarity: measures of `mimic.metric.similarity` of the poses, each of shape [frames].
       match: which links correspond.
       base: of the learner in the expert's base frame, see `LinkMatch.ghost`.
+      objects: poses of objects, in the expert's base frame [m].
     """
 
     title: str
@@ -68,6 +69,7 @@ class Clip:
     similarity: Mapping[str, Float[np.ndarray, " frames"]]
     match: LinkMatch
     base: Sequence[float] | None = None
+    objects: Float[np.ndarray, "frames objects 4 4"] | None = None
 
 
 class ClipPlan(NamedTuple):
@@ -135,13 +137,20 @@ def _data_set_clip(config: RenderConfig) -> ClipPlan:
         raise ValueError(f"demonstration: expected a number from 0 to {last}, got {config.demonstration}")
 
     def compute() -> Clip:
-        own, qpos, learner_qpos = motions.of_episode(config.demonstration)
+        own, *values, objects = motions.of_episode(config.demonstration)
         time = np.arange(own[0], own[-1] + 1e-9, 1 / FRAMES_PER_SECOND)
-        at_frames = [np.stack([np.interp(time, own, x) for x in angles.T], axis=1) for angles in (qpos, learner_qpos)]
+        qpos, learner_qpos, poses = (_interpolated(time, own, x) for x in (*values, objects.reshape(len(own), -1)))
         title = f"{Path(config.retargeted).name}, {motions.episodes[config.demonstration]}"
-        return dataclasses.replace(_static_clip(env, title, time - time[0], *at_frames), base=motions.base)
+        clip = _static_clip(env, title, time - time[0], qpos, learner_qpos)
+        return dataclasses.replace(clip, base=motions.base, objects=poses.reshape(len(time), *objects.shape[1:]))
 
     return ClipPlan(env, None, compute)
+
+
+def _interpolated(time: np.ndarray, own: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values [samples, columns] at other times."""
+    columns = [np.interp(time, own, column) for column in values.T]
+    return np.stack(columns, axis=1) if columns else np.zeros((len(time), 0))
 
 
 def _arm_of(role: str, config: RenderConfig, joints: Sequence[str]) -> ArmConfig:

@@ -12,22 +12,25 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
-from jaxtyping import UInt8  # noqa: E402
+from jaxtyping import Float, UInt8  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from matplotlib.text import Text  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 
+from mimic.arms.link_match import Capsule  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.base.compilation import use_compilation_cache  # noqa: E402
 from mimic.base.config import check_new  # noqa: E402
 from mimic.commands.clips import FRAMES_PER_SECOND, Clip, prepare_clip  # noqa: E402
 from mimic.commands.config import RenderConfig  # noqa: E402
 from mimic.evaluation.labels import similarity_texts  # noqa: E402
+from mimic.retargeting.hand_target import placed_hands, placement  # noqa: E402
 
 _SIZE, _DPI = (1280, 640), 100  # pixels
 _SCENE = 760, 548  # pixels of the arms' picture
-_LEGEND = "same colour: corresponding links; translucent: expert, {}; red: locked joints"
+_LEGEND = "same colour: corresponding links; translucent: expert, {}; red: locked joints{}"
+_AXIS, _AXIS_RADIUS = 0.08, 0.006  # m, of the frames of objects
 _CAPTIONS = 56  # pixels below it; the title is above it
 _LEGEND_ROOM = 1.25  # height of the axes relative to the maximum distance, so that the legend hides no curve
 
@@ -103,7 +106,7 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
     """
     figure = plt.figure(figsize=(_SIZE[0] / _DPI, _SIZE[1] / _DPI), dpi=_DPI)
     scene_width = _SCENE[0] / _SIZE[0]  # fraction of the frame that shows the arms
-    scene.fit(clip.poses)
+    scene.fit(clip.poses, [objects[..., :3, 3].reshape(-1, 3) for objects in _objects(clip)])
     left, width = scene_width + 0.07, 1 - scene_width - 0.09
     bounds = 0, _CAPTIONS / _SIZE[1], scene_width, _SCENE[1] / _SIZE[1]
     picture = _add_scene(figure, bounds, scene, clip)
@@ -132,9 +135,23 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
 
 
 def _image(scene: ArmScene, clip: Clip, frame: int) -> UInt8[np.ndarray, "height width 3"]:
-    """Both arms, and the expert's ghost at the learner."""
+    """Both arms, the expert's ghost at the learner, and the axes of objects at both."""
     poses = [poses[frame] for poses in clip.poses]
-    return scene.image(poses, clip.match.ghost(*poses, base=clip.base))
+    at_expert, at_learner = ([*_axes(objects[frame])] for objects in _objects(clip))
+    return scene.image(poses, [*clip.match.ghost(*poses, base=clip.base), *at_learner], at_expert)
+
+
+def _objects(clip: Clip) -> list[Float[np.ndarray, "frames objects 4 4"]]:
+    """Poses of objects in the base frames of both arms."""
+    objects = np.zeros((len(clip.time), 0, 4, 4)) if clip.objects is None else clip.objects
+    return [objects, placed_hands(placement(clip.base), objects)]
+
+
+def _axes(poses: Float[np.ndarray, "objects 4 4"]) -> Iterator[Capsule]:
+    """The axes of frames, x red, y green and z blue."""
+    for pose in poses:
+        for axis, colour in zip(pose[:3, :3].T, np.eye(3), strict=True):
+            yield Capsule(pose[:3, 3], pose[:3, 3] + _AXIS * axis, _AXIS_RADIUS, (*(0.15 + 0.75 * colour), 1.0))
 
 
 def _add_scene(figure: Figure, bounds: Bounds, scene: ArmScene, clip: Clip) -> Any:
@@ -145,7 +162,8 @@ def _add_scene(figure: Figure, bounds: Bounds, scene: ArmScene, clip: Clip) -> A
     left, bottom, width, height = bounds
     for place, label in zip(scene.centres(), clip.labels, strict=True):
         figure.text(left + place * width, 0.6 * bottom, label, ha="center", va="center", fontsize=13)
-    legend = _LEGEND.format("scaled to the learner" if clip.base is None else "where it is")
+    objects = "; axes: objects" if clip.objects is not None and clip.objects.size else ""
+    legend = _LEGEND.format("scaled to the learner" if clip.base is None else "where it is", objects)
     figure.text(left + width / 2, 0.2 * bottom, legend, ha="center", va="center", fontsize=9, color="dimgrey")
     figure.text(left + 0.02, (1 + bottom + height) / 2, clip.title, va="center", fontsize=12)
     return picture

@@ -18,6 +18,7 @@ _NAMES = (
     "episodes",
     "time",
     "split_points",
+    "objects",
     *(f"{arm}_{what}" for arm in _ARMS for what in ("qpos", "joints")),
 )
 
@@ -33,6 +34,7 @@ class RetargetedMotions:
       time: of the samples [s].
       split_points: [episodes + 1] index of the first sample of each, and the number of samples.
       base: of the learner in the expert's base frame, [x, y, z, yaw] [m, rad].
+      objects: [samples, objects, 4, 4] their poses in the expert's base frame; of none where they are not known.
     """
 
     episodes: tuple[str, ...]
@@ -41,11 +43,12 @@ class RetargetedMotions:
     time: Float[np.ndarray, " samples"]
     split_points: np.ndarray
     base: Sequence[float]
+    objects: Float[np.ndarray, "samples objects 4 4"]
 
-    def of_episode(self, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Times of an episode, and the angles of expert and learner."""
+    def of_episode(self, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Times of an episode, the angles of expert and learner, and the objects."""
         rows = slice(*self.split_points[number : number + 2])
-        return self.time[rows], self.qpos["expert"][rows], self.qpos["learner"][rows]
+        return self.time[rows], self.qpos["expert"][rows], self.qpos["learner"][rows], self.objects[rows]
 
 
 def save_motions(
@@ -71,6 +74,10 @@ def save_motions(
         arrays |= {f"{name}_joints": np.array(arm.joint_names)}
     arrays["time"] = np.concatenate([motion.time for motion in own])
     arrays["split_points"] = np.cumsum([0, *(len(motion.time) for motion in own)])
+    objects = [motion.objects for motion in own]
+    counts = {-1 if poses is None else poses.shape[1] for poses in objects}
+    known = -1 not in counts and len(counts) == 1  # and the same in all episodes
+    arrays["objects"] = np.concatenate(objects) if known else np.zeros((len(arrays["time"]), 0, 4, 4))  # type: ignore[arg-type]
     np.savez_compressed(folder / MOTIONS, **arrays)  # pyright: ignore[reportArgumentType]
 
 
@@ -89,11 +96,12 @@ def read_motions(folder: Path) -> RetargetedMotions:
         qpos = {arm: np.asarray(arrays[f"{arm}_qpos"], float) for arm in _ARMS}
         episodes, points = tuple(map(str, arrays["episodes"])), np.asarray(arrays["split_points"], int)
         time, base = np.asarray(arrays["time"], float), np.asarray(arrays["base"], float)
-        if not _are_motions(joints, qpos, episodes, points, time, base):
+        objects = np.asarray(arrays["objects"], float)
+        if not _are_motions(joints, qpos, episodes, points, time, base, objects):
             raise ValueError("shapes, times or values that are no motions")
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"retargeted: {str(path)!r} is damaged: {error}") from error
-    return RetargetedMotions(episodes, joints, qpos, time, points, base.tolist())
+    return RetargetedMotions(episodes, joints, qpos, time, points, base.tolist(), objects)
 
 
 def _are_motions(
@@ -103,12 +111,14 @@ def _are_motions(
     points: np.ndarray,
     time: np.ndarray,
     base: np.ndarray,
+    objects: np.ndarray,
 ) -> bool:
     """Whether shapes fit, values are finite, and times increase within each episode."""
     shapes_fit = all(qpos[arm].shape == (len(time), len(joints[arm])) for arm in _ARMS)
+    shapes_fit &= objects.ndim == 4 and objects.shape[::2] == (len(time), 4) and objects.shape[3] == 4
     shapes_fit &= time.ndim == 1 and base.shape == (4,) and points.shape == (len(episodes) + 1,)
     if not shapes_fit or points[0] != 0 or points[-1] != len(time) or (np.diff(points) <= 0).any():
         return False
     ends = points[1:-1] - 1  # from which to the next there is another episode
     steps = np.delete(np.diff(time), ends)
-    return all(np.isfinite(array).all() for array in (*qpos.values(), time, base)) and bool((steps > 0).all())
+    return all(np.isfinite(array).all() for array in (*qpos.values(), time, base, objects)) and bool((steps > 0).all())

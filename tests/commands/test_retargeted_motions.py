@@ -31,10 +31,22 @@ def test_an_episode_comes_back(folder):
     assert found.episodes == tuple(LENGTHS)
     assert found.joints == {"expert": panda().joint_names, "learner": planar_arm((0.3,) * 4).joint_names}
     assert found.base == BASE
-    time, qpos, learner_qpos = found.of_episode(1)
+    time, qpos, learner_qpos, objects = found.of_episode(1)
+    assert objects.shape == (7, 0, 4, 4)
     np.testing.assert_array_equal(time, motions(7)["second"].time)
     np.testing.assert_array_equal(qpos, motions(7)["second"].qpos)
     np.testing.assert_array_equal(learner_qpos, motions(4)["second"].qpos)
+
+
+def test_objects_come_back_where_all_episodes_have_the_same_number(tmp_path):
+    arms, own = (panda(), planar_arm((0.3,) * 4)), motions(7)
+    poses = {name: np.random.default_rng(0).normal(size=(length, 2, 4, 4)) for name, length in LENGTHS.items()}
+    own = {name: motion._replace(objects=poses[name]) for name, motion in own.items()}
+    save_motions(tmp_path, arms, own, motions(4), BASE)
+    np.testing.assert_array_equal(read_motions(tmp_path).of_episode(1)[3], poses["second"])
+    own["second"] = own["second"]._replace(objects=poses["second"][:, :1])
+    save_motions(tmp_path, arms, own, motions(4), BASE)
+    assert read_motions(tmp_path).objects.shape == (sum(LENGTHS.values()), 0, 4, 4)
 
 
 def test_what_is_no_such_folder_is_one_line(tmp_path):

@@ -39,6 +39,7 @@ class Motion(NamedTuple):
       gripper: [samples, channels] joints or opening of the gripper, as the source has them; None without a gripper.
       hand: [samples, 3] positions of the hand in any axes; None where the source has none.
       hand_step: [samples, 3] commanded steps of the hand in the axes of the base, in any unit; None without.
+      objects: [samples, objects, 4, 4] poses of objects in the arm's base frame [m]; None where not known.
     """
 
     time: Float[np.ndarray, " samples"]
@@ -47,6 +48,7 @@ class Motion(NamedTuple):
     gripper: Float[np.ndarray, "samples channels"] | None = None
     hand: Float[np.ndarray, "samples 3"] | None = None
     hand_step: Float[np.ndarray, "samples 3"] | None = None
+    objects: Float[np.ndarray, "samples objects 4 4"] | None = None
 
     def take(self, index: Any) -> "Motion":
         """The samples with these indices."""

@@ -12,6 +12,7 @@ import numpy as np
 from mimic.base.distribution import import_extra
 from mimic.base.files import check_file, read_text
 from mimic.motions.formats.episodes import EXTRA, MAX_NUMBERS, Motion, Recording
+from mimic.motions.formats.hdf5_objects import JOINTS, object_poses
 from mimic.motions.formats.names import Selection, hand_position, parse_column, select
 from mimic.motions.formats.tables import TIMES, seconds
 
@@ -36,10 +37,11 @@ class Episode(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Columns of qpos and qvel in flattened states by the names of joints."""
+    """Columns of qpos and qvel in flattened states by the names of joints, and the model."""
 
     qpos: dict[str, int]
     qvel: dict[str, int]
+    model: ElementTree.Element
 
 
 def is_hdf5(path: Path) -> bool:
@@ -154,7 +156,11 @@ def _motion(episode: Episode, layout: _Layout | None, selection: Selection, rate
     numbered = {name: [str(column) for column in range(1, width + 1)] for name, width in _widths(episode)}
     found = hand_position({name: columns for name, columns in numbered.items() if len(episode.sets[name]) == len(qpos)})
     hand = _columns(episode.sets[found[0]])[:, :3] if found else None
-    return Motion(_times(episode, len(qpos), layout, rate), qpos, qvel, gripper, hand, _hand_steps(episode, len(qpos)))
+    steps, objects = _hand_steps(episode, len(qpos)), None
+    if layout and len(episode.sets[STATES]) == len(qpos):  # an arm is before the objects
+        joints = selection.joints if selection.entry == STATES else list(layout.qpos)[: qpos.shape[1]]
+        objects = object_poses(layout.model, layout.qpos, _columns(episode.sets[STATES]), joints)
+    return Motion(_times(episode, len(qpos), layout, rate), qpos, qvel, gripper, hand, steps, objects)
 
 
 def _widths(episode: Episode) -> Iterator[tuple[str, int]]:
@@ -264,12 +270,13 @@ def _layout(file: Path, episode: Episode) -> _Layout | None:
     return _Layout(
         {name: 1 + int(start) for name, (start, _) in zip(names, starts, strict=True)},
         {name: qvel + int(start) for name, (_, start) in zip(names, starts, strict=True)},
+        root,
     )
 
 
 def _joints(body: ElementTree.Element) -> Iterator[ElementTree.Element]:
     """The joints of a body and those of its children, in MuJoCo's order."""
-    yield from (element for element in body if element.tag in ("joint", "freejoint"))
+    yield from (element for element in body if element.tag in JOINTS)
     for child in body.findall("body"):
         yield from _joints(child)
 
