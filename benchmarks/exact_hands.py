@@ -272,8 +272,8 @@ def followed_by_pyroki(arm: Embodiment, targets: np.ndarray, start: np.ndarray) 
 
 
 def shoulder_elbow_wrist(arm: Embodiment, qpos: np.ndarray) -> np.ndarray:
-    """Anchors [3, time, 3] of joints 2, 4 and 6 in the base frame, of arms with six joints of 2, 3 and 5."""
-    chosen = (1, 3, 5) if arm.num_joints == 7 else (1, 2, 4)
+    """Anchors [3, time, 3] of joints 2, 4 and 6 in the base frame; with fewer joints 2, 3 and the next to last."""
+    chosen = (1, 3, 5) if arm.num_joints == 7 else (1, 2, arm.num_joints - 2)
     motions = list(joint_motions(arm, qpos))
     points = [
         motions[joint - 1][..., :3, :3] @ arm.joint_anchor[joint] + motions[joint - 1][..., :3, 3] for joint in chosen

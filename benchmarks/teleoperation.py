@@ -27,7 +27,16 @@ import numpy as np
 import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
-from benchmarks.exact_hands import SPEEDS, as_numbers, demonstrations, hand_matrices, homogeneous, joint_motions
+from benchmarks.exact_hands import (
+    SPEEDS,
+    as_numbers,
+    demonstrations,
+    hand_matrices,
+    homogeneous,
+    mink_model,
+    posture,
+    ssik_solver,
+)
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.control.clearance import clearance
@@ -48,7 +57,7 @@ TIMES = "method p50_ms:.3f p99_ms:.3f p999_ms:.3f core_us_p50:.1f core_us_p99:.1
 # rad/s (data sheets); Piper's model states 0 for its first joint, those of robosuite nothing.
 SPEED = {
     "piper": [3.14, 3.40, 3.14, 3.92, 3.92, 3.92],
-    "panda": [2.175] * 4 + [2.61] * 3,
+    "panda": SPEEDS["panda"],
     "so101": [4.7] * 5,
     "ur5e": SPEEDS["ur5e"],
     "iiwa": SPEEDS["iiwa14"],
@@ -114,31 +123,16 @@ def ratios(path: np.ndarray, operator: mimic.Teleoperator, rate: float) -> tuple
     return float(largest), 1e3 * float(beyond), count
 
 
-def landmarks(embodiment: Embodiment, qpos: np.ndarray) -> np.ndarray:
-    """Anchors [3, time, 3] of shoulder, elbow and wrist in chain lengths, in the base frame."""
-    chosen = {5: (1, 2, 3), 6: (1, 2, 4), 7: (1, 3, 5)}[embodiment.num_joints]
-    motions = list(joint_motions(embodiment, qpos))
-    points = [motions[i - 1] @ np.append(embodiment.joint_anchor[i], 1) for i in chosen]
-    return np.stack(points)[..., :3] / float(embodiment.chain_length)
-
-
 def resemblance(leader: Embodiment, follower: Embodiment, base: Any, qpos: np.ndarray, own: np.ndarray) -> Row:
-    """Mean distance of the elbows [chain lengths], and angle of the planes of shoulder, elbow and wrist."""
-    points = landmarks(leader, qpos), landmarks(follower, own) @ placement(base).rotation.T
-    points = [x - x[:1] for x in points]
-    normals = [np.cross(x[1], x[2]) for x in points]
-    normals = [x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-9) for x in normals]
-    cosine = np.minimum(np.abs(np.sum(normals[0] * normals[1], axis=-1)), 1)  # a plane has two normals
-    elbow = np.linalg.norm(points[0][1] - points[1][1], axis=-1).mean()
-    return {"elbow": elbow, "plane_deg": np.degrees(np.arccos(cosine)).mean()}
+    """Mean distance of elbows and wrists [chain lengths], and angle of the planes of shoulder, elbow and wrist."""
+    return {key: x.mean() for key, x in posture(leader, follower, base, qpos, own).items()}
 
 
 def driven(operator: mimic.Teleoperator, leader_qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Commands, seconds of each step, and states; engaged on the first pose until its hand is reached or nearest."""
     operator.engage()
-    for _ in range(1000):
-        if operator.step(leader_qpos[0]).status.state in ("tracking", "nearest"):
-            break
+    while operator.step(leader_qpos[0]).status.state not in ("tracking", "nearest"):
+        pass
     path, seconds, states = [], [], []
     for sample in leader_qpos:
         began = time.perf_counter()
@@ -353,9 +347,7 @@ def tracked_by_ssik(
 ) -> tuple[np.ndarray, np.ndarray]:
     import ssik
 
-    points = np.concatenate([np.zeros((1, 3)), follower.joint_anchor, follower.hand_position])
-    manipulator = ssik.Manipulator.from_axes(follower.joint_axis, np.diff(points, axis=0), limits=follower.joint_range)
-    back = homogeneous(follower.hand_rotation[0].T, np.zeros(3))
+    manipulator, back = ssik_solver(follower)
     tracker, path, seconds = ssik.Tracker(manipulator, start, max_joint_speed=speed), [], []
     for tick, target in enumerate(targets):
         began = time.perf_counter()
@@ -370,8 +362,6 @@ def tracked_by_mink(
 ) -> tuple[np.ndarray, np.ndarray]:
     """One step of mink's inverse kinematics for each target, within the limits of position and velocity."""
     import mink
-
-    from benchmarks.exact_hands import mink_model
 
     model = mink_model(follower)
     configuration = mink.Configuration(model, start)

@@ -25,7 +25,7 @@ _FREE, _SPEED_TIME = 0.8, 0.03  # of the velocity limits: below, the path's spee
 _APPROACH = 0.5  # of the velocity limits, until the first goal after `engage` is reached: nobody knows the way there
 _OVERTIME = 1.25  # of the time that a posture is away
 _STUCK = 0.3  # s with a hand that is not reached, after which another branch is searched
-_LINE, _DETOUR = 16, 1.1  # points of a straight way to another branch; it may increase the hand's cost so much
+_LINE, _DETOUR = 16, 2.0  # points of a straight way to another branch; it may increase the hand's cost so much
 _SLOWING, _RETREAT = 0.1, 0.05  # s in which links that come near each other lose 63 % of the room; m/s apart, at most
 _AT_WALL = 1e-6  # m
 _BACKED = 4  # times that a step which goes too far is halved
@@ -113,7 +113,7 @@ class LiveFollower:
     def follow(self, goal: Goal) -> Float[np.ndarray, " joints"]:
         """The command of a tick [rad]."""
         self._goal = goal
-        self._advance(goal)
+        self._advance()
         qpos = self._limiter.step(self.path, self._speed)
         rows = self._rows(np.array([self.posture, qpos]))
         self._posture_rows = rows[:1]
@@ -123,7 +123,7 @@ class LiveFollower:
         self._left = self.posture_error.position / self._rows.unit
         return qpos
 
-    def _advance(self, goal: Goal) -> None:
+    def _advance(self) -> None:
         """Moves the posture towards the goal, and the path towards the posture."""
         if self._waits():
             self._speed = 0 * self._speed
@@ -136,7 +136,7 @@ class LiveFollower:
         self.held_apart = ""
         for _ in range(self._steps):
             near, walls = self._walls(posture[0])
-            before, posture = posture, self._pose.step(goal, posture, lower, upper, NEAR, self._left, rows, walls)
+            before, posture = posture, self._pose.step(self._goal, posture, lower, upper, NEAR, self._left, rows, walls)
             self._hold_apart(near, walls, posture[0] - before[0])
             if near is not None:
                 posture = self._backed(before[0], posture[0], near)[None]
@@ -149,7 +149,7 @@ class LiveFollower:
         is_free = self.is_near and fraction < _FREE and not self.held_apart
         kept = 1 - self._smoothing
         self._speed = kept * self._speed + self._smoothing / self._period * moved if is_free else 0 * moved
-        self._search(goal)
+        self._search()
         if self._searched is not None and not self.is_near:
             return  # where an approach goes is not known yet
         if self.is_near:
@@ -220,7 +220,7 @@ class LiveFollower:
             self.held_apart = self._contacts.names(near)
         return is_held
 
-    def _search(self, goal: Goal) -> None:
+    def _search(self) -> None:
         """Searches other branches at the start of an approach, and while the hand is not reached, in each tick."""
         if self._searched is None:
             is_well = self.posture_error.is_reached or self.is_fastest or not self.is_near
@@ -238,7 +238,7 @@ class LiveFollower:
             return
         self._searched, self._stuck, self._is_chosen = None, 0.0, True
         posture = self._turned(found[0])
-        if not self.is_near or self._leads_there(goal, posture, found[1]):
+        if not self.is_near or self._leads_there(posture, found[1]):
             self.posture, self._posture_rows, self.is_near = posture, None, False
             self._time_left = _OVERTIME * self._period * self._ticks_away(posture)
 
@@ -247,10 +247,10 @@ class LiveFollower:
         turned = posture - 2 * np.pi * np.round((posture - self.path) / (2 * np.pi))
         return np.where((turned >= self._lower) & (turned <= self._upper), turned, posture)
 
-    def _leads_there(self, goal: Goal, posture: np.ndarray, cost: float) -> bool:
-        """Whether another branch is better, and the hand does not go away from its goal on the straight way there."""
+    def _leads_there(self, posture: np.ndarray, cost: float) -> bool:
+        """Whether another branch is better, and the hand does not go far from its goal on the straight way there."""
         line = self.posture + np.linspace(0, 1, _LINE)[:, None] * (posture - self.posture)
-        costs = self._pose.cost(goal, self._rows(line))
+        costs = self._pose.cost(self._goal, self._rows(line))
         self._allowed = _DETOUR * float(costs[0])
         is_better = cost < 0.5 * costs[0] and costs.max() <= self._allowed
         return is_better and not (self._contacts and self._contacts.touch(line[1:]).any())
