@@ -14,7 +14,7 @@ from rich.console import Console
 
 from mimic.base.compilation import compilation_cache, use_compilation_cache
 from mimic.base.config import explain, merged, schema, typed
-from mimic.base.files import open_file, read_json
+from mimic.base.files import open_file
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_report
 from mimic.envs import EnvConfig, env_config
@@ -22,7 +22,7 @@ from mimic.envs.imitation import ImitationEnv
 from mimic.envs.make import make_env
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.runs.files import DEMONSTRATIONS, REPORT
+from mimic.runs.files import DEMONSTRATIONS, read_report
 from mimic.runs.signals import Signals
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig, TrainerConfig, trainer_config, trainers
@@ -72,10 +72,7 @@ class Run:
         Raises:
           ValueError: there is none, because the training has not ended, or it cannot be read.
         """
-        try:
-            return read_json(self.run_dir / REPORT)
-        except (OSError, ValueError) as error:
-            raise ValueError(f"{str(self.run_dir / REPORT)!r} cannot be read: {error}") from error
+        return read_report(self.run_dir)
 
     @property
     def plots(self) -> dict[str, "Image"]:

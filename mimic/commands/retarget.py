@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import json
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,7 +21,6 @@ from mimic.arms.gripper import GripperRange, gripper_range
 from mimic.base import compat
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import new_folder
-from mimic.base.files import write_atomically
 from mimic.commands.certificate_plot import plot_certificates
 from mimic.commands.config import RetargetConfig
 from mimic.commands.retargeted_motions import save_motions
@@ -34,9 +32,9 @@ from mimic.retargeting.base_placement import find_base
 from mimic.retargeting.certificate import Certificate, certify
 from mimic.retargeting.motions import largest_jump, retarget_motions
 from mimic.retargeting.self_collision import make_contacts
-from mimic.runs.files import finite, written_atomically
+from mimic.runs.files import REPORT, write_report, written_atomically
 
-_REPORT, _PICTURE = "report.json", "certificate.png"
+_PICTURE = "certificate.png"
 _WARNING = "warning"  # how notes begin that are printed before the work
 _ATTEMPTS, _FEW = 4, 0.2  # for each episode; fraction of its frames that fail
 _THREADS = 8  # at most; each certifies an episode
@@ -115,7 +113,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], int]:
             ranges, yaw = np.asarray(learner.joint_range, float), used.base[3] if used.base else 0.0
             lines = write_data_set(data, folder, learner, motions, kept, ranges, yaw)
             report = _report(data, certificates, kept, used, config)
-            write_atomically(folder / _REPORT, json.dumps(finite(report), indent=2) + "\n")
+            write_report(folder, report)
             save_motions(folder, (expert, learner), data.measured, motions[data.entry], used.base)
             plot_certificates(certificates, dt, folder / _PICTURE, f"{expert.name} to {learner.name}, {data.path.name}")
         _print(console, data, certificates, kept, used, lines)
@@ -277,7 +275,7 @@ def _print(
         )
     console.print(table)
     lines = [f"episodes: {len(kept)} of {len(certificates) + len(data.faults)} are written"]
-    lines += [f"{len(names) - _SHOWN} more episodes in {_REPORT}"] if len(names) > _SHOWN else []
+    lines += [f"{len(names) - _SHOWN} more episodes in {REPORT}"] if len(names) > _SHOWN else []
     for name in [name for name in names if not certificates[name].is_ok][:_SHOWN]:
         runs = list(certificates[name].failures())
         first, last, cause = max(runs, key=lambda run: run[1] - run[0])

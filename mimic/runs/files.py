@@ -33,6 +33,18 @@ def write_report(run_dir: Path, report: Mapping[str, Any]) -> None:
     write_atomically(run_dir / REPORT, json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
 
 
+def read_report(run_dir: Path) -> dict[str, Any]:
+    """The content of report.json.
+
+    Raises:
+      ValueError: there is none, because the training has not ended, or it cannot be read.
+    """
+    try:
+        return read_json(run_dir / REPORT)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{str(run_dir / REPORT)!r} cannot be read: {error}") from error
+
+
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Writes a table."""
     text = io.StringIO(newline="")
@@ -45,8 +57,8 @@ def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) 
 def reported_steps(run_dir: Path, unit: str) -> int:
     """Training steps of the parameters in a run's report; -1 without a report."""
     try:
-        return int(read_json(run_dir / REPORT)[unit])
-    except (OSError, ValueError, LookupError, TypeError):
+        return int(read_report(run_dir)[unit])
+    except (ValueError, LookupError, TypeError):
         return -1
 
 

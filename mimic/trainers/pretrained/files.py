@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from mimic.base.files import read_json
-from mimic.runs.files import REPORT, write_report
+from mimic.runs.files import write_report
 from mimic.runs.parameters import named_leaves, read_parameters
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.run_config import load_config, save_config
+from mimic.trainers.run_config import save_config
 
 PARAMETERS = "parameters.npz"
 SOURCE = "source"  # key of the report: command and commit that trained the network
@@ -38,20 +37,6 @@ def write_network(
     save_config(folder, dataclasses.replace(config, run_dir="", resume="", init=""))
     os.replace(partial, folder / PARAMETERS)
     write_report(folder, report)
-
-
-def read_config_and_report(folder: Path) -> tuple[TrainConfig, dict[str, Any]]:
-    """Config and report of a trained network.
-
-    Raises:
-      ValueError: a file is missing or cannot be read.
-    """
-    config = load_config(folder)
-    try:
-        report = read_json(folder / REPORT)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{str(folder / REPORT)!r} cannot be read: {error}") from error
-    return config, report
 
 
 def read_params(folder: Path, template: Any) -> Any:

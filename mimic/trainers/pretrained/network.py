@@ -14,8 +14,10 @@ from jaxtyping import Array, Float
 from mimic.arms.embodiment import Embodiment
 from mimic.base import compat
 from mimic.base.config import check_choice
+from mimic.runs.files import read_report
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.pretrained.files import SOURCE, read_config_and_report, read_params
+from mimic.trainers.pretrained.files import SOURCE, read_params
+from mimic.trainers.run_config import load_config
 
 if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv
@@ -121,11 +123,11 @@ def read_network(folder: Path, kind: str) -> Pretrained:
     Raises:
       ValueError: a file is missing, damaged, or of another kind of network.
     """
-    config, report = read_config_and_report(folder)
+    config = load_config(folder)
     if config.trainer.name != TRAINERS[kind]:
         raise ValueError(f"{str(folder)!r}: expected a network of trainer={TRAINERS[kind]}, got {config.trainer.name}")
     function = _policy(folder, config) if kind == "policy" else _mapper(folder, config)
-    return Pretrained(config.env.name, kind, config, report, function)
+    return Pretrained(config.env.name, kind, config, read_report(folder), function)
 
 
 def policy_template(config: TrainConfig) -> tuple[Any, Any]:
