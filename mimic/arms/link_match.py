@@ -104,13 +104,7 @@ def link_ends(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.n
 
 def hand_poses(arm: Embodiment, qpos: Float[np.ndarray, "*batch joints"]) -> Float[np.ndarray, "*batch hands 4 4"]:
     """The hand frame of each chain in poses [rad], in the base frame [m], by NumPy alone."""
-    return hands_of_bodies(arm, *_body_poses(arm, qpos))
-
-
-def hands_of_bodies(
-    arm: Embodiment, rotations: Float[np.ndarray, "*batch bodies 3 3"], shifts: Float[np.ndarray, "*batch bodies 3"]
-) -> Float[np.ndarray, "*batch hands 4 4"]:
-    """See `hand_poses`; from the rotations and shifts of the bodies."""
+    rotations, shifts = _body_poses(arm, qpos)
     body = np.array(arm.hand_joint, int) + 1
     rotation, position = rotations[..., body, :, :], np.asarray(arm.hand_position, float)[..., None]
     poses = np.zeros((*rotation.shape[:-2], 4, 4))

@@ -91,7 +91,7 @@ def matched_hands(expert: Embodiment, learner: Embodiment) -> np.ndarray:
     return np.array(matched_chains(expert.chain_names, learner.chain_names)).reshape(-1, 2)
 
 
-def _hand_components(arm: Embodiment, frames: list[JointFrame]) -> list[tuple[Vector, Rotation]]:
+def hand_components(arm: Embodiment, frames: list[JointFrame]) -> list[tuple[Vector, Rotation]]:
     """Position and axes (rows) of each hand, in the units of the arm."""
     rows = hand_vectors(arm, frames)
     triples = zip(rows[::3], rows[1::3], rows[2::3], strict=True)
@@ -100,7 +100,7 @@ def _hand_components(arm: Embodiment, frames: list[JointFrame]) -> list[tuple[Ve
 
 def hands(arm: Embodiment, qpos: Scalars, chosen: Any) -> HandTarget:
     """Some hands of an arm, in its base frame; each with the batch axes of the joint angles last."""
-    vectors = _hand_components(arm, joint_frames(arm, qpos, None))
+    vectors = hand_components(arm, joint_frames(arm, qpos, None))
     vectors = [vectors[hand] for hand in chosen]
 
     def stack(values: list[Any]) -> Array:
@@ -173,11 +173,11 @@ def hand_cost_derivatives(
       store: see `mimic.retargeting.optimizers.Store`.
     """
     arm, unit, joints = in_chain_lengths(learner), 1 / spatial.scalar(learner.chain_length), learner.num_joints
-    lines = [_line(arm, arm.hand_joint[hand]) for hand in chosen]
+    lines = [joint_line(arm, arm.hand_joint[hand]) for hand in chosen]
 
     def kinematics(qpos: Scalars) -> tuple[list[Vector], list[Vector], list[tuple[Vector, Rotation]]]:
         frames = joint_frames(arm, qpos, None)
-        return joint_axes(arm, frames), [frame.anchor for frame in frames[1:]], _hand_components(arm, frames)
+        return joint_axes(arm, frames), [frame.anchor for frame in frames[1:]], hand_components(arm, frames)
 
     def terms(of_pose: Any) -> list[_HandTerms]:
         axes, anchors, vectors = of_pose
@@ -238,7 +238,7 @@ def _hand_terms(
     return _HandTerms(value, force, spatial.scale(half, torque), velocities, axes, couplings)
 
 
-def _line(arm: Embodiment, joint: int) -> list[int]:
+def joint_line(arm: Embodiment, joint: int) -> list[int]:
     """A joint and its ancestors, from the base on."""
     line = []
     while joint >= 0:
