@@ -52,7 +52,10 @@ EPISODES = (
     "plane_deg:.1f"
 )
 SWEEPS = "pair steps not_finite beyond_mrad:.6f of_limits:.4f recovery_s:.2f holding:.1% clearance_mm:.1f"
-POSTURES = "follower method position_mm_p50:.2f position_mm_p95:.2f hand_direction_deg:.2f elbow:.3f plane_deg:.1f"
+POSTURES = (
+    "follower method position_mm_p50:.2f position_mm_p95:.2f hand_direction_deg:.2f elbow:.3f plane_deg:.1f "
+    "distance:.4f"
+)
 TIMES = "method p50_ms:.3f p99_ms:.3f p999_ms:.3f core_us_p50:.1f core_us_p99:.1f"
 # rad/s (data sheets); Piper's model states 0 for its first joint, those of robosuite nothing.
 SPEED = {
@@ -157,7 +160,7 @@ def episodes(options: argparse.Namespace) -> Iterator[Row]:
     nearest = jax.jit(
         lambda qpos: mimic.imitate_pose(leader, follower, qpos, **metric.arguments, hand="exact", base=BASE)
     )
-    distance = jax.jit(jax.vmap(lambda q, own: metric(*states(leader, follower, BASE, q, own))))
+    distance = distance_of(leader, follower, BASE)
     for rate in (15.0, _RATE):
         paths = paths if rate != _RATE else [resampled(path, 15.0) for path in paths]
         qpos = np.concatenate(paths)
@@ -179,6 +182,12 @@ def episodes(options: argparse.Namespace) -> Iterator[Row]:
                 row |= {"bound": within[: len(qpos[judged])].mean(), "violations": sum(x[2] for x in of_limits)}
                 row |= {"of_limits": max(x[0] for x in of_limits), "stalled_s": stalled(runs, paths, rate)}
             yield as_numbers(row)
+
+
+def distance_of(leader: Embodiment, follower: Embodiment, base: Any) -> Callable[..., Any]:
+    """The embodiment distance by the default metric, of postures of both arms [time, joints]."""
+    metric = MetricConfig().build(leader, follower)
+    return jax.jit(jax.vmap(lambda q, own: metric(*states(leader, follower, base, q, own))))
 
 
 def states(leader: Embodiment, follower: Embodiment, base: Any, qpos: Any, own: Any) -> tuple[Any, Any]:
@@ -317,8 +326,10 @@ def postures(options: argparse.Namespace) -> Iterator[Row]:
         own = {"mimic": driven(operator, qpos)[0]}
         own["mink"], _ = tracked_by_mink(follower, targets, own["mimic"][0], speed)
         own["ssik's Tracker"], _ = tracked_by_ssik(follower, targets, own["mimic"][0], speed)
+        distance = distance_of(leader, follower, base)
         for method, path in own.items():
             row = hand_errors(leader, follower, base, qpos, path) | resemblance(leader, follower, base, qpos, path)
+            row |= {"distance": float(distance(qpos, path).mean())}
             yield as_numbers({"follower": name, "method": method, "steps": len(path), **row})
 
 
