@@ -120,7 +120,7 @@ def _serve_session(
         show_live(page, times, session, env, expert(), numbers_rate)
 
     after = functools.partial(_finish, config, session)
-    return serve(config, env, _title(config, env), show_session, None, after, rate)
+    return serve(config, env, _title(config, env), show_session, after, rate)
 
 
 def _session(config: ViewConfig, env: EnvConfig) -> LiveSession:
@@ -211,17 +211,15 @@ def _prepare_playback(config: ViewConfig) -> Callable[[], int]:
     trained.env.check_one_learner()
     trainer = make_ppo_trainer(trained, run_dir)
     _, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
-    playback = Playback(trained.env, trainer.evaluator)
 
-    def evaluate() -> None:
+    def run() -> int:
         with Console().status("running the policy on all demonstrations and computing the kinematic bound"):
-            playback.replace(trainer.evaluate(params))
+            playback = Playback(trained.env, trainer.evaluator, trainer.evaluate(params))
             _ = trainer.evaluator.lower_bound
+        play = functools.partial(_play, playback=playback, split=config.split)
+        return serve(config, trained.env, _title(config, trained.env), play)
 
-    def play(page: "Page", times: Iterator[float]) -> None:
-        _play(page, times, playback, config.split)
-
-    return lambda: serve(config, trained.env, _title(config, trained.env), play, before=evaluate)
+    return run
 
 
 def _play(page: "Page", times: Iterator[float], playback: "Playback", split: str) -> None:

@@ -52,20 +52,14 @@ def serve(
     env: EnvConfig,
     title: str,
     show: "Callable[[Page, Iterator[float]], None]",
-    before: Callable[[], None] | None = None,
     after: Callable[[], None] | None = None,
     rate: float = RATE,
 ) -> int:
-    """Serves a page until a signal, with a rate of frames [1/s].
-
-    Calls `before` before the server starts and `after` when it has ended.
-    """
+    """Serves a page until a signal, with a rate of frames [1/s]; calls `after` when it has ended."""
     from mimic.viewer.meshes import ArmShape
     from mimic.viewer.page import Page
     from mimic.viewer.server import make_server
 
-    if before is not None:
-        before()
     if not is_local(config.host):
         print(
             f"view: host={config.host}: everyone who can reach this machine can see and move the arms; there is no "

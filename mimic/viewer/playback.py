@@ -23,25 +23,19 @@ class Playback:
     Args:
       env: environment of the run.
       evaluator: evaluator of the run.
+      rollouts: of all demonstrations.
     """
 
-    def __init__(self, env: EnvConfig, evaluator: Evaluator):
-        self._evaluator = evaluator
-        self._rollouts: Rollouts | None = None
+    def __init__(self, env: EnvConfig, evaluator: Evaluator, rollouts: Rollouts):
+        self._evaluator, self._rollouts = evaluator, rollouts
         self._locked = dict(build_arm(env.learner, env.limits).locked)
         self._rollout = functools.lru_cache(maxsize=16)(self._compute_rollout)
-
-    def replace(self, rollouts: Rollouts) -> None:
-        """Plays these rollouts of all demonstrations from now on."""
-        self._rollouts = rollouts
-        self._rollout.cache_clear()
 
     def count(self, split: str) -> int:
         """Number of demonstrations in a split."""
         return len(range(self._evaluator.env.demonstrations.count)[self._evaluator.parts[split]])
 
     def _compute_rollout(self, split: str, demonstration: int) -> RolloutFrames:
-        assert self._rollouts is not None
         index = demonstration_index(self._evaluator, split, demonstration)
         return RolloutFrames(self._evaluator, self._rollouts, index, FRAMES_PER_SECOND)
 
