@@ -84,6 +84,7 @@ class Teleoperator:
     Attributes:
       limits: of the follower.
       period: of a tick [s].
+      is_engaged: whether the leader drives.
       engagements: number of times that the clutch was engaged.
 
     Raises:

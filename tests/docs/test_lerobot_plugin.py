@@ -11,7 +11,7 @@ import pytest
 
 import mimic
 from mimic.arms.link_match import hand_poses
-from tests.helpers import original_model
+from tests.helpers import original_model, real_data
 from tests.helpers.repository import REPOSITORY
 
 if importlib.util.find_spec("lerobot") is None or importlib.util.find_spec("torch") is None:
@@ -120,6 +120,32 @@ def test_the_step_starts_where_the_robot_is(options):
     lost = pipeline(({}, observation))  # a sample without the leader's joints: the follower holds
     assert np.isfinite(list(lost.values())).all()
     assert plugin.MimicFollowerStep(**step.get_config()).get_config() == step.get_config()
+
+
+@real_data.needs(real_data.DATA / "arms/so101/so101_new_calib.urdf")
+def test_an_so101_drives_a_piper():
+    """The hand of the six joints goes as far as that of the five, and a gripper goes with it."""
+    models = [str(real_data.DATA / "arms" / file) for file in ("so101/so101_new_calib.urdf", "piper.urdf")]
+    arms = [mimic.build_arm(mimic.ArmConfig(model=model), "hardware").embodiment for model in models]
+    start = np.array([0.0, 1.2, -1.2, 0.0, 0.5, 0.0])
+    step = plugin.MimicFollowerStep(
+        leader_model=models[0], follower_model=models[1], fps=FPS, velocity=3.0, start=np.degrees(start).tolist()
+    )
+    pipeline = RobotProcessorPipeline(
+        steps=[step], to_transition=robot_action_observation_to_transition, to_output=transition_to_robot_action
+    )
+    led, actions = 0.2 * np.sin(np.minimum(np.arange(150), 120)[:, None] / FPS * np.arange(1, 6)), []
+    for qpos in led:
+        names = (f"{name}.pos" for name in arms[0].joint_names)
+        actions.append(pipeline((dict(zip(names, np.degrees(qpos), strict=True)) | {plugin.GRIPPER: 25.0}, {})))
+    moved = np.radians([[action[f"{name}.pos"] for name in arms[1].joint_names] for action in actions])
+    of_leader, of_follower = (
+        hand_poses(arm, path[-1])[0, :3, 3] - hand_poses(arm, path[0])[0, :3, 3]
+        for arm, path in zip(arms, (led, moved), strict=True)
+    )
+    assert np.linalg.norm(of_leader) > 0.02
+    np.testing.assert_allclose(of_follower, of_leader, atol=1e-3)  # m, as `REACHED`
+    assert actions[-1][plugin.GRIPPER] == pytest.approx(25.0)
 
 
 @pytest.mark.parametrize(("values", "message"), [
