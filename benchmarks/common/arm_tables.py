@@ -218,6 +218,28 @@ def transfers(results: Results) -> list[Cells]:
     return rows
 
 
+def transfer_speeds(*measured: Results) -> list[Cells]:
+    """How fast data sets are retargeted, on each of the machines."""
+    header = (
+        "arm",
+        "frames",
+        "exact",
+        "frames/s, compiled",
+        "of these per second of a processor",
+        "command, s (processors)",
+    )
+    rows: list[Cells] = [("on", *header)]
+    for results in measured:
+        hardware = results["hardware"]
+        device = f"{hardware['cpu_cores']} cores" if hardware["backend"] == "cpu" else hardware["device"]
+        for row in results["rows"]:
+            rates = (f"{row[key]:,.0f}" for key in ("frames", "frames_per_s", "frames_per_cpu_s"))
+            frames, *speeds = rates
+            command = f"{row['command_s']:.0f} ({row['cpu_s']:.0f})"
+            rows.append((device, row["learner"], frames, percent(row["exact"]), *speeds, command))
+    return rows
+
+
 def transferred_teleoperation(results: Results) -> list[Cells]:
     rows: list[Cells] = [("mapping", "hand's direction, mean [deg]", "hand's position, median / 95 % [mm]")]
     for row in results["teleoperation"]:

@@ -8,9 +8,7 @@ each thread computes a chunk; elsewhere the chunks of many motions are one batch
 """
 
 import functools
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +19,7 @@ from jaxtyping import Array, Float
 from mimic.arms.pose_limits import pose_limits
 from mimic.base import compat
 from mimic.base.compilation import UNOPTIMIZED, by_value, compiled_once, in_background
-from mimic.retargeting.exact_chunks import CHUNK, in_chunks
+from mimic.retargeting.exact_chunks import CHUNK, in_chunks, in_threads
 from mimic.retargeting.exact_pose import DESCENTS, FINE, ExactTargets, exact_solver
 from mimic.retargeting.hand_target import Placement, is_exact
 from mimic.retargeting.initial_guesses import RandomPoses
@@ -32,7 +30,6 @@ SPACING, SEGMENTS = 16, CHUNK // 16  # times from one anchor to the next, and su
 INEXACT = 10.0  # distance that an exact hand is worth, at each time
 PER_METRE = 1e3  # of the error of a hand that is not exact
 _BRANCHES = 9  # at each anchor
-_THREADS = 8  # at most, each with a chunk
 _AT_ONCE = 64  # chunks of a batch at most
 _STEPS, _DAMPING = 4, 1e-3  # Newton's method from the neighbouring time
 _SLACK = 0.95  # of the maximum change for candidates, which are finished afterwards
@@ -71,14 +68,11 @@ def candidates_of_motions(
     every = np.stack([chunk for of_motion in chunks for chunk in of_motion])
     size = 1 if compat.is_cpu() else min(1 << (len(every) - 1).bit_length(), _AT_ONCE)
     candidates_of = _candidates(*arms)
-    first, *others = in_chunks(every, size)
 
     def computed(group: np.ndarray) -> Candidates:
         return jax.device_get(candidates_of(group, base, random, jump))
 
-    groups = [computed(first)]  # which compiles
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as pool:
-        groups += pool.map(computed, others)
+    groups = in_threads(computed, list(in_chunks(every, size)))
     of_chunks = Candidates(*(np.concatenate(part) for part in zip(*groups, strict=True)))
     ends = np.cumsum([len(of_motion) for of_motion in chunks])
     return [

@@ -1,7 +1,9 @@
 """Functions of a fixed number of times, so that motions of all lengths share what is compiled."""
 
-from collections.abc import Callable, Iterator
-from typing import Any
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -12,8 +14,11 @@ from mimic.base.compilation import compiled_once
 from mimic.retargeting.exact_pose import exact_solver
 from mimic.retargeting.hand_target import Placement
 
+T = TypeVar("T")
+
 CHUNK = 256  # times
 _ELSEWHERE = 8  # such chunks at once, where these are not on a CPU
+_THREADS = 8  # at most, each with arrays of its own
 
 
 def in_chunks(rows: np.ndarray, size: int, overlap: int = 0) -> Iterator[np.ndarray]:
@@ -32,6 +37,14 @@ def by_chunks(function: Callable[..., Any], *arrays: np.ndarray) -> tuple[np.nda
     chunks = zip(*(in_chunks(array, size) for array in arrays), strict=True)
     results = [function(*chunk) for chunk in chunks]
     return tuple(np.concatenate(jax.device_get(part))[: len(arrays[0])] for part in zip(*results, strict=True))
+
+
+def in_threads(function: Callable[..., T], *arguments: Sequence[Any]) -> Iterator[T]:
+    """As `map`: a function of the first arguments, which compiles, and then of the others in threads."""
+    first, *others = zip(*arguments, strict=True)
+    yield function(*first)
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as pool:
+        yield from pool.map(lambda values: function(*values), others)
 
 
 @compiled_once

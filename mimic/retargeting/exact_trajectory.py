@@ -7,9 +7,7 @@ hand where it is. Where its hand is still not exact at some times, although ther
 are searched among all postures of its self-motions.
 """
 
-import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -25,7 +23,7 @@ from mimic.base.compilation import compiled_once
 from mimic.metric.distance import Metric
 from mimic.retargeting.costs import NO_COSTS, Costs
 from mimic.retargeting.exact_candidates import INEXACT, PER_METRE, Candidates, candidates_of_motions
-from mimic.retargeting.exact_chunks import CHUNK, by_chunks, hand_report, in_chunks
+from mimic.retargeting.exact_chunks import CHUNK, by_chunks, hand_report, in_chunks, in_threads
 from mimic.retargeting.exact_pose import ExactTargets, exact_solver
 from mimic.retargeting.hand_target import (
     HandError,
@@ -41,7 +39,6 @@ from mimic.retargeting.path_smoothing import smoothed
 from mimic.retargeting.pose import PoseImitation, wrap_angles
 from mimic.retargeting.self_motions import past_failing_times
 
-_THREADS = 8  # at most, each with a motion
 _STEPS, _DAMPING = 4, 1e-3  # Newton's method from the last time
 _LEAP = 1.001  # of the maximum change: a path that changes by more passes to another branch
 _PER_STEP = 1.0  # distance that a step on the way to another branch costs, of arms that stay exact meanwhile
@@ -87,9 +84,7 @@ def exact_trajectories(
     def motion(poses: np.ndarray, candidates: Candidates) -> PoseImitation:
         return jax.block_until_ready(_motion(arms, poses, base, jump, candidates))
 
-    yield motion(motions[0], candidates[0])  # which compiles
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as pool:
-        yield from pool.map(motion, motions[1:], candidates[1:])
+    yield from in_threads(motion, motions, candidates)
 
 
 def _motion(

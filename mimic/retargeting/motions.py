@@ -13,6 +13,7 @@ from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.costs import Costs
+from mimic.retargeting.exact_chunks import in_threads
 from mimic.retargeting.exact_pose import SET
 from mimic.retargeting.exact_trajectory import exact_trajectories
 from mimic.retargeting.hand_target import placement
@@ -89,20 +90,21 @@ def retarget_motions(
     if hand != "scaled":
         check_hand("exact", base, expert, learner)
         costs.check_capsules(capsules)
-        jump, random = (
-            np.asarray(largest_jump, np.float32),
-            random_poses(learner, key, STARTS["exact"], np.float32, SET),
-        )
+        jump = np.asarray(largest_jump, np.float32)
+        random = random_poses(learner, key, STARTS["exact"], np.float32, SET)
         arguments = placement(base), jump, random, costs, capsules if costs.of_capsules else None
         poses = [np.asarray(qpos, np.float32) for qpos in motions]
         for solution in exact_trajectories(expert, learner, built, poses, *arguments):
             yield np.asarray(solution.qpos, float)
         return
-    for qpos in motions:  # padded, so that motions of similar lengths share what is compiled
+
+    def scaled(qpos: np.ndarray) -> np.ndarray:  # padded, so that motions of similar lengths share what is compiled
         length = max(_SHORTEST, 1 << (len(qpos) - 1).bit_length())
         padded = qpos[np.minimum(np.arange(length), len(qpos) - 1)]
         solution = imitate_trajectory(
             expert, learner, jnp.asarray(padded, jnp.float32), largest_jump=largest_jump, key=key, costs=costs,
             capsules=capsules, **built.arguments,
         )  # fmt: skip
-        yield np.asarray(solution.qpos, float)[: len(qpos)]
+        return np.asarray(solution.qpos, float)[: len(qpos)]
+
+    yield from in_threads(scaled, motions)
