@@ -201,17 +201,18 @@ def captured_policies(results: Results) -> list[Cells]:
 # Data sets of other arms
 
 
-def transfers(results: Results) -> list[Cells]:
+def transfers(results: Results, *replays: Results) -> list[Cells]:
     """Demonstrations on each arm: how many keep all hands, and how many succeed in robosuite by each method."""
+    physics = [row for replayed in replays for row in replayed["physics"]]
     titles = {"mimic": "succeed in robosuite", "ssik": "ssik", "mink": "mink", "copied": "joints copied"}
-    methods = [method for method in titles if where(results["physics"], method=method)]
+    methods = [method for method in titles if where(physics, method=method)]
     rows: list[Cells] = [("arm", "exact in all frames", "frames", *(titles[method] for method in methods))]
     learners = list(dict.fromkeys(row["learner"] for row in results["pairs"]))
     for name in [learners, *([learner] for learner in learners)]:
         pairs = [row for row in results["pairs"] if row["learner"] in name]
         frames = sum(row["exact"] for row in pairs) / sum(row["frames"] for row in pairs)
-        replays = [row for row in results["physics"] if row["learner"] in name]
-        succeed = [sum(row["success"] for row in where(replays, method=method)) for method in methods]
+        of_arm = [row for row in physics if row["learner"] in name]
+        succeed = [sum(row["success"] for row in where(of_arm, method=method)) for method in methods]
         exact = sum(row["exact"] == row["frames"] for row in pairs)
         counts = [f"{count} of {len(pairs)}" for count in (exact, *succeed)]
         rows.append((name[0] if len(name) == 1 else "all", counts[0], percent(frames), *counts[1:]))
@@ -219,24 +220,13 @@ def transfers(results: Results) -> list[Cells]:
 
 
 def transfer_speeds(*measured: Results) -> list[Cells]:
-    """How fast data sets are retargeted, on each of the machines."""
-    header = (
-        "arm",
-        "frames",
-        "exact",
-        "frames/s, compiled",
-        "of these per second of a processor",
-        "command, s (processors)",
-    )
-    rows: list[Cells] = [("on", *header)]
-    for results in measured:
-        hardware = results["hardware"]
-        device = f"{hardware['cpu_cores']} cores" if hardware["backend"] == "cpu" else hardware["device"]
-        for row in results["rows"]:
-            rates = (f"{row[key]:,.0f}" for key in ("frames", "frames_per_s", "frames_per_cpu_s"))
-            frames, *speeds = rates
-            command = f"{row['command_s']:.0f} ({row['cpu_s']:.0f})"
-            rows.append((device, row["learner"], frames, percent(row["exact"]), *speeds, command))
+    """How fast data sets are retargeted; times of processors, on machines that do other work too."""
+    header = "arm", "frames", "exact", "frames per second of a processor", "command, seconds of processors"
+    rows: list[Cells] = [header]
+    for row in (row for results in measured for row in results["rows"]):
+        frames, speed = (f"{row[key]:,.0f}" for key in ("frames", "frames_per_cpu_s"))
+        command = f"{row['cpu_s']:.0f} for {row['command_frames']:,} frames"
+        rows.append((row["learner"], frames, percent(row["exact"]), speed, command))
     return rows
 
 
