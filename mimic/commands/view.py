@@ -235,5 +235,6 @@ def _play(page: "Page", times: Iterator[float], playback: "Playback", split: str
 
 
 def _title(config: ViewConfig, env: EnvConfig) -> str:
-    controller = f"policy of {Path(config.run).name}" if config.run else "pose mapper" if config.mapper else "optimiser"
-    return f"{env.name or 'mimic'}: the {controller} moves the learner"
+    if config.run:
+        return f"{env.name}: the policy of {Path(config.run).name} moves the learner"
+    return f"The {'pose mapper' if config.mapper else 'optimiser'} moves the learner"
