@@ -26,12 +26,14 @@ def object_poses(
       joints: names of the arm's joints, base to tip.
 
     Returns:
-      None where there is no such body, and where the model has what is not computed here.
+      None where there is no such body, where states are not finite, and where the model has what is not computed here.
     """
     if any(body.get(key) for body in model.iter("body") for key in _OTHER_ROTATIONS):
         return None
     base, objects = None, []
     free = [columns.get(joint.get("name", ""), 0) for joint in model.iter() if _is_free(joint)]
+    if not np.isfinite(states).all():
+        return None
     if any(not np.all(np.linalg.norm(states[:, first + 3 : first + 7], axis=1) > 0) for first in free):
         return None  # no rotation
     for tree in (tree for world in model.findall("worldbody") for tree in world.findall("body")):

@@ -49,9 +49,10 @@ def test_what_is_not_computed_has_no_objects(changes):
     assert object_poses(model, COLUMNS, np.ones((2, 12)), ["j1"]) is None
 
 
-def test_a_free_object_without_a_rotation_is_none():
+@pytest.mark.parametrize(("columns", "value"), [(slice(6, 10), 0), (3, np.nan), (10, np.inf)])
+def test_an_object_without_a_pose_is_none(columns, value):
     states = np.ones((2, 12))
-    states[1, 6:10] = 0
+    states[1, columns] = value
     assert object_poses(ElementTree.fromstring(MODEL), COLUMNS, states, ["j1"]) is None
 
 
