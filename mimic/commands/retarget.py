@@ -23,7 +23,7 @@ from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import new_folder
 from mimic.commands.certificate_plot import plot_certificates
 from mimic.commands.config import RetargetConfig
-from mimic.commands.retargeted_motions import save_motions
+from mimic.commands.retargeted_motions import MOTIONS, save_motions
 from mimic.metric.config import MetricConfig
 from mimic.motions.formats.episodes import Motion
 from mimic.motions.grippers import other_gripper
@@ -64,12 +64,17 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], int]:
     """Checks the config and reads the data set; the returned function retargets, certifies and writes it.
 
     Raises:
-      ValueError: a key without effect, a source that cannot be read, arms without the hands that `hand` needs, or `out`
-        exists.
+      ValueError: a key without effect, costs of motion with exact hands, a source that cannot be read or is named as
+        another file in `out`, arms without the hands that `hand` needs, or `out` exists.
     """
     use_compilation_cache(config.compilation_cache)
     if not config.source:
         raise ValueError("source: expected a data set or a file of demonstrations, as in source=FOLDER")
+    source = Path(config.source).expanduser()
+    if source.name in (MOTIONS, _PICTURE, REPORT):
+        raise ValueError(f"source: expected another name than {source.name}, which is of a file beside the data set")
+    if config.hand != "scaled" and config.costs.of_motion:
+        raise ValueError("costs: expected no velocity or acceleration with an exact or near hand; hand=scaled has them")
     out, env = new_folder("out", config.out), config.resolve()
     expert, learner = env.build_arms().embodiments
     free = build_arm(dataclasses.replace(env.expert, home=None), config.limits or "none").embodiment
@@ -80,8 +85,8 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], int]:
                 "needs none"
             )
     data = read_data_set(
-        Path(config.source).expanduser(), free, joints=config.joints, topic=config.topic, units=config.units,
-        rate=config.rate, joint_range=expert.joint_range,
+        source, free, joints=config.joints, topic=config.topic, units=config.units, rate=config.rate,
+        joint_range=expert.joint_range,
     )  # fmt: skip
     dt = float(np.median(np.concatenate([np.diff(motion.time) for motion in data.measured.values()])))
     shapes = _shapes(env.learner, env.limits)

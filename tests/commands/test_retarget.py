@@ -55,6 +55,8 @@ def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows():
         (["source=none.csv", "base=[1,2]"], "base: expected same, auto or [x,y,z,yaw], got [1, 2]"),
         (["source=none.csv", "failing=maybe"], "failing: expected one of left_out, kept"),
         (["source=none.csv", "out=new"], "source: no file at 'none.csv'"),
+        (["source=certificate.npz", "out=new"], "source: expected another name than certificate.npz"),
+        (["source=none.csv", "out=new", "costs.velocity=1"], "costs: expected no velocity or acceleration"),
         (["source={recorded}", "env=planar4dof"], "out: expected a folder"),
         (["source={recorded}", "learner=panda4dof", "out=new"], "recorded with the joints"),
         (["source={recorded}", "learner=pair", "out=new"], "learner: expected an arm, or an environment"),
