@@ -119,7 +119,8 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], int]:
             lines = write_data_set(data, folder, learner, motions, kept, ranges, yaw)
             report = _report(data, certificates, kept, used, config)
             write_report(folder, report)
-            save_motions(folder, (expert, learner), data.measured, motions[data.entry], used.base)
+            base = None if config.hand == "scaled" else used.base or [0.0] * 4
+            save_motions(folder, (expert, learner), data.measured, motions[data.entry], base)
             plot_certificates(certificates, dt, folder / _PICTURE, f"{expert.name} to {learner.name}, {data.path.name}")
         _print(console, data, certificates, kept, used, lines)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)

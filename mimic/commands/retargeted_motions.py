@@ -33,7 +33,7 @@ class RetargetedMotions:
       qpos: [samples, joints] angles by arm [rad].
       time: of the samples [s].
       split_points: [episodes + 1] index of the first sample of each, and the number of samples.
-      base: of the learner in the expert's base frame, [x, y, z, yaw] [m, rad].
+      base: of the learner in the expert's base frame, [x, y, z, yaw] [m, rad]; None with hand=scaled.
       objects: [samples, objects, 4, 4] their poses in the expert's base frame; of none where they are not known.
     """
 
@@ -42,7 +42,7 @@ class RetargetedMotions:
     qpos: Mapping[str, Float[np.ndarray, "samples joints"]]
     time: Float[np.ndarray, " samples"]
     split_points: np.ndarray
-    base: Sequence[float]
+    base: Sequence[float] | None
     objects: Float[np.ndarray, "samples objects 4 4"]
 
     def of_episode(self, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -65,10 +65,10 @@ def save_motions(
       arms: expert and learner.
       measured: of the expert, by episode [rad].
       motions: of the learner, by episode [rad].
-      base: of the learner in the expert's base frame; None for the same.
+      base: of the learner in the expert's base frame; None where each arm counts from its own base.
     """
     own = [measured[name] for name in motions]
-    arrays = {"base": np.zeros(4) if base is None else np.array(base, float), "episodes": np.array(list(motions))}
+    arrays = {"base": np.array([] if base is None else base, float), "episodes": np.array(list(motions))}
     for name, arm, found in zip(_ARMS, arms, (own, motions.values()), strict=True):
         arrays |= {f"{name}_qpos": np.concatenate([motion.qpos for motion in found])}
         arrays |= {f"{name}_joints": np.array(arm.joint_names)}
@@ -101,7 +101,7 @@ def read_motions(folder: Path) -> RetargetedMotions:
             raise ValueError("shapes, times or values that are no motions")
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"retargeted: {str(path)!r} is damaged: {error}") from error
-    return RetargetedMotions(episodes, joints, qpos, time, points, base.tolist(), objects)
+    return RetargetedMotions(episodes, joints, qpos, time, points, base.tolist() or None, objects)
 
 
 def _are_motions(
@@ -116,7 +116,7 @@ def _are_motions(
     """Whether shapes fit, values are finite, and times increase within each episode."""
     shapes_fit = all(qpos[arm].shape == (len(time), len(joints[arm])) for arm in _ARMS)
     shapes_fit &= objects.ndim == 4 and objects.shape[::2] == (len(time), 4) and objects.shape[3] == 4
-    shapes_fit &= time.ndim == 1 and base.shape == (4,) and points.shape == (len(episodes) + 1,)
+    shapes_fit &= time.ndim == 1 and base.shape in ((4,), (0,)) and points.shape == (len(episodes) + 1,)
     if not shapes_fit or points[0] != 0 or points[-1] != len(time) or (np.diff(points) <= 0).any():
         return False
     ends = points[1:-1] - 1  # from which to the next there is another episode

@@ -8,6 +8,7 @@ import pytest
 
 import mimic
 from mimic.commands import retarget
+from mimic.commands.retargeted_motions import read_motions
 from mimic.retargeting.certificate import Certificate
 from mimic.retargeting.motions import largest_jump, retarget_motions
 from tests.helpers.commands import run
@@ -30,6 +31,7 @@ def test_demonstrations_become_those_of_the_learner(recorded, tmp_path):
     env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
     motions.check_fits(env.learner, 0.1, 50)
     assert motions.count == 3 and motions.torque is None
+    assert read_motions(out).base is None  # so that a video shows the expert in the learner's size
 
 
 @pytest.mark.slow

@@ -20,6 +20,11 @@ def motions(joints):
     }
 
 
+def test_motions_in_chain_lengths_have_no_base(tmp_path):
+    save_motions(tmp_path, (panda(), panda()), motions(7), motions(7), None)
+    assert read_motions(tmp_path).base is None
+
+
 @pytest.fixture
 def folder(tmp_path):
     save_motions(tmp_path, (panda(), planar_arm((0.3,) * 4)), motions(7), motions(4), BASE)
