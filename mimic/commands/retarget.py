@@ -75,6 +75,8 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], int]:
         raise ValueError(f"source: expected another name than {source.name}, which is of a file beside the data set")
     if config.hand != "scaled" and config.costs.of_motion:
         raise ValueError("costs: expected no velocity or acceleration with an exact or near hand; hand=scaled has them")
+    if config.hand == "scaled" and config.base == "auto":
+        raise ValueError("base: expected no auto with hand=scaled, which compares each arm from its own base")
     out, env = new_folder("out", config.out), config.resolve()
     expert, learner = env.build_arms().embodiments
     free = build_arm(dataclasses.replace(env.expert, home=None), config.limits or "none").embodiment
@@ -269,15 +271,14 @@ def _print(
     names = sorted(certificates, key=lambda name: certificates[name].is_ok)
     for name in names[:_SHOWN]:
         item = certificates[name]
-        clearance = item.clearance.min()
         table.add_row(
             name,
             f"{item.is_exact.sum()} of {len(item.causes)}",
-            f"{1e3 * item.position.max():.2f}",
-            f"{np.degrees(item.rotation.max()):.2f}",
+            _number(1e3 * item.position.max(), 2),
+            _number(np.degrees(item.rotation.max()), 2),
             f"{np.degrees(item.margin.min()):.1f}",
             f"{item.speed.max():.0%}",
-            "-" if np.isnan(clearance) else f"{1e3 * clearance:.0f}",
+            _number(1e3 * item.clearance.min(), 0),
         )
     console.print(table)
     lines = [f"episodes: {len(kept)} of {len(certificates) + len(data.faults)} are written"]
@@ -294,6 +295,11 @@ def _print(
     lines += [f"commands: {', '.join(data.commands) or 'none'}"]
     lines.append(_gripper_line(data, setting))
     _print_lines(console, [*lines, *written, *filter(None, [_help_line(certificates, setting)])])
+
+
+def _number(value: float, digits: int) -> str:
+    """A cell of the table; what is not known, as of an arm without a hand or without shapes, is a dash."""
+    return "-" if np.isnan(value) else f"{value:.{digits}f}"
 
 
 def _print_lines(console: Console, lines: Sequence[str]) -> None:
