@@ -1,4 +1,4 @@
-"""4. Train a neural pose mapper, and retarget whole motions with it.
+"""4. Train a neural pose mapper, and compare it with the optimiser on poses and on whole motions.
 
     python examples/04_pose_mapper.py [FOLDER]
 
