@@ -21,7 +21,8 @@ _LAGS = 0.0, 0.05, 0.1, 0.2, 0.3, 0.5  # s, of measured angles behind commands
 _SHORT_PATH, _FITS = 0.03, 5.0  # m, mm: a path of the hand that says nothing, and an error that is none
 _FIT_STEPS, _TOOL_STIFFNESS = 8, 0.02  # Gauss-Newton; the tool's offset must not explain all
 _STEP_LAG, _UNCORRELATED = 1, 0.4  # samples from a commanded step of the hand; 1 minus the correlation
-_PRESSES = 0.5  # of the median over axes: the hand's steps for commanded ones, where something holds it
+_PRESSES = 0.5  # of the median over commanded axes: the hand's steps for commanded ones, where something holds it
+_COMMANDED = 0.01  # of the most commanded axis: the sum of squares of one that is commanded
 
 
 class Evidence(NamedTuple):
@@ -175,8 +176,9 @@ def _of_hand_steps(arm: Embodiment, samples: Samples, steps: np.ndarray) -> Evid
         position, _ = hand_points(arm, qpos)
         step = position[:, len(first) :] - position[:, : len(first)]
         products, squares, commanded = np.sum(step * stated, axis=1), np.sum(step**2, axis=1), np.sum(stated**2, axis=0)
-        gain = np.sqrt(squares / np.maximum(commanded, 1e-12))
-        counts = gain >= _PRESSES * np.median(gain, axis=1, keepdims=True)
+        is_led = commanded > _COMMANDED * commanded.max()
+        gain = np.sqrt(squares / np.where(is_led, commanded, 1.0))
+        counts = ~is_led | (gain >= _PRESSES * np.median(gain[:, is_led], axis=1, keepdims=True))
         norms = np.sqrt(np.sum(counts * squares, axis=1) * np.sum(counts * commanded, axis=1))
         return (1 - np.sum(counts * products, axis=1) / np.maximum(norms, 1e-12))[:, None]
 

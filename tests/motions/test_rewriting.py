@@ -251,6 +251,20 @@ def test_a_hand_that_presses_fits_its_commanded_steps_and_another_arm_does_not()
     assert wrong > evidence.tolerance
 
 
+def test_a_hand_that_is_led_along_one_axis_fits_its_commanded_steps():
+    """The hand also trembles along the others, which nothing commands."""
+    arm, time = mimic.panda(), np.arange(200) / RATE
+    tremor = 1e-4 * np.random.default_rng(0).normal(size=(200, 7))
+    qpos = np.array(arm.home) + tremor + 0.1 * np.sin(time[:, None]) * np.eye(7)[0]  # along y
+    samples, (hand, _) = samples_of({"a": Motion(time, qpos, None)}), hand_points(arm, qpos)
+    steps = np.vstack([np.diff(hand, axis=0), np.zeros((1, 3))]) * [0, 1, 0]
+    evidence = _of_hand_steps(arm, samples, np.roll(steps, -1, axis=0))
+    negated = evidence.rows * [-1, 1, 1, 1, 1, 1, 1]
+    right, wrong = evidence.errors(np.stack([evidence.rows, negated]))[:, 0]
+    assert right < evidence.tolerance / 2
+    assert wrong > evidence.tolerance
+
+
 @needs(ROBOSUITE)
 def test_a_recorded_hand_that_wipes_a_table_has_no_warning():
     pytest.importorskip("h5py")
