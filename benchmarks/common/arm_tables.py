@@ -203,7 +203,7 @@ def captured_policies(results: Results) -> list[Cells]:
 
 def transfers(results: Results, *replays: Results) -> list[Cells]:
     """Demonstrations on each arm: how many keep all hands, and how many succeed in robosuite by each method."""
-    physics = [row for replayed in replays for row in replayed["physics"]]
+    physics = [row for replayed in (results, *replays) for row in replayed["physics"]]
     titles = {"mimic": "succeed in robosuite", "ssik": "ssik", "mink": "mink", "copied": "joints copied"}
     methods = [method for method in titles if where(physics, method=method)]
     rows: list[Cells] = [("arm", "exact in all frames", "frames", *(titles[method] for method in methods))]
