@@ -18,7 +18,7 @@ class HandStates:
     Attributes:
       position: [hands, 3] origins; in chain lengths where normalized, else [m].
       axes: [3 hands, 3] unit x-, y- and z-axis of each hand in turn; z is the approach, and the gripper opens along x.
-      angular_velocity: [hands, 3] [rad/s].
+      angular_velocity: [hands, 3] in rad/s.
     """
 
     position: Float[Array, "hands 3"]

@@ -46,7 +46,11 @@ def import_demonstrations(
       arm: the expert.
       dt: control step [s].
       horizon: steps of a demonstration.
-      joints, topic, units, rate, joint_range: see `read_recording`.
+      joints: see `read_recording`.
+      topic: see `read_recording`.
+      units: see `read_recording`.
+      rate: see `read_recording`.
+      joint_range: see `read_recording`.
 
     Returns:
       The demonstrations, and lines about what was assumed, changed or left out.

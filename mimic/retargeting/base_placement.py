@@ -53,7 +53,9 @@ def find_base(
       motions: of the expert, [T, n] each [rad].
       correspondence: see `embodiment_distance`.
       weights: see `embodiment_distance`.
-      rotation, reduction, hand_weights: see `embodiment_distance`.
+      rotation: see `embodiment_distance`.
+      reduction: see `embodiment_distance`.
+      hand_weights: see `embodiment_distance`.
       largest_jump: see `imitate_trajectory`.
       seed: of the search.
 

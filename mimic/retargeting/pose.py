@@ -102,7 +102,7 @@ def imitate_pose(
         within the joint ranges the one of minimum distance. Where none is found, as with fewer than six joints or out
         of reach, the hand's position is the nearest, and then its rotation: see `PoseImitation.hand`. Costs count among
         postures with this hand; `method`, `iterations` and `kept` are of "free", which leaves the hand to the metric.
-      base: the learner's base in the expert's base frame, for exact hands: [x, y, z, yaw] [m, rad], or a pose [4, 4];
+      base: the learner's base in the expert's base frame, for exact hands: x, y, z, yaw in m and rad, or a pose [4, 4];
         None for the same base. Link directions are compared in the same axes, positions each from its own base.
       starts: number of random initial guesses, 12 where None, 35 for exact hands; with 0 the expert's angles are the
         only one.

@@ -55,7 +55,9 @@ class TeleoperationRecorder:
         """As `Teleoperator.step`.
 
         Args:
-          leader_qpos, gripper, time: see there.
+          leader_qpos: see there.
+          gripper: see there.
+          time: see there.
           measured: [joints] angles of the follower at the start of the tick [rad]; by default the last command.
         """
         operator = self.operator
