@@ -220,12 +220,12 @@ def transfers(results: Results, *replays: Results) -> list[Cells]:
 
 
 def transfer_speeds(*measured: Results) -> list[Cells]:
-    """How fast data sets are retargeted; times of processors, on machines that do other work too."""
-    header = "arm", "frames", "exact", "frames per second of a processor", "command, seconds of processors"
+    """How fast data sets are retargeted, by compiled functions and by a command without a compilation cache."""
+    header = "arm", "frames", "exact", "frames/s", "command, without compiled functions"
     rows: list[Cells] = [header]
     for row in (row for results in measured for row in results["rows"]):
-        frames, speed = (f"{row[key]:,.0f}" for key in ("frames", "frames_per_cpu_s"))
-        command = f"{row['cpu_s']:.0f} for {row['command_frames']:,} frames"
+        frames, speed = (f"{row[key]:,.0f}" for key in ("frames", "frames_per_s"))
+        command = f"{row['command_s']:.0f} s for {row['command_frames']:,} frames"
         rows.append((row["learner"], frames, percent(row["exact"]), speed, command))
     return rows
 
