@@ -6,10 +6,11 @@ FOLDER/NAME/NAME.xml are robosuite's arms with the Panda's gripper, from `benchm
 expert is the Panda of the package. The data set has the recordings of the five tasks again and again until there are
 enough frames, each with another angle of the first joint, so that no two episodes are the same.
 
-`command_s` is of `python -m mimic.retarget` from its start to its end with base=auto and without a compilation cache,
-on the recordings alone, and `cpu_s` the seconds of processors that it takes. The base that it finds is then used for
-the whole data set in this process, where reading, retargeting, certifying and writing are timed the second time:
-`frames_per_s`, and `frames_per_cpu_s` of processors. `candidates_per_s` are frames for which JAX alone finds postures.
+`command_s` is of `python -m mimic.retarget` from its start to its end with base=auto and an empty compilation cache, on
+the recordings alone, and `cpu_s` the seconds of processors that it takes. The base that it finds is then used for the
+whole data set in this process, with what the command compiled; reading, retargeting, certifying and writing are timed
+the second time: `frames_per_s`, and `frames_per_cpu_s` of processors. `candidates_per_s` are frames for which JAX alone
+finds postures.
 """
 
 import argparse
@@ -64,12 +65,14 @@ def write_episodes(path: Path, demonstrations: Path, frames: int) -> list[np.nda
     return motions
 
 
-def command(source: Path, learner: Path, out: Path) -> Row:
+def command(source: Path, learner: Path, out: Path, cache: Path) -> Row:
     """The whole command in a process of its own, and its report."""
-    shutil.rmtree(out, ignore_errors=True)
-    keys = f"source={source}", "expert=panda", f"learner={learner}", f"out={out}", "base=auto", "failing=kept"
+    for folder in (out, cache):
+        shutil.rmtree(folder, ignore_errors=True)
+    arms = f"source={source}", "expert=panda", f"learner={learner}", f"out={out}"
+    keys = "base=auto", "failing=kept", f"compilation_cache={cache}"
     began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, "-m", "mimic.retarget", *keys, "compilation_cache="], check=True)
+    subprocess.run([sys.executable, "-m", "mimic.retarget", *arms, *keys], check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     report = json.loads((out / "report.json").read_text())
@@ -77,12 +80,13 @@ def command(source: Path, learner: Path, out: Path) -> Row:
     return {"base": report["base"], "command_frames": frames, "command_s": time.perf_counter() - began, "cpu_s": cpu}
 
 
-def whole(source: Path, learner: Path, out: Path, base: list[float]) -> Row:
+def whole(source: Path, learner: Path, out: Path, cache: Path, base: list[float]) -> Row:
     """Reading, retargeting, certifying and writing in this process."""
     shutil.rmtree(out, ignore_errors=True)
     env = EnvConfig(expert=ArmConfig(model="panda"), learner=ArmConfig(model=str(learner)))
     began, cpu = time.perf_counter(), time.process_time()
-    work = prepare_retargeting(RetargetConfig(source=str(source), env=env, out=str(out), base=base, failing="kept"))
+    files = {"source": str(source), "out": str(out), "compilation_cache": str(cache)}
+    work = prepare_retargeting(RetargetConfig(env=env, base=base, failing="kept", **files))
     assert work() == 0
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     episodes = json.loads((out / "report.json").read_text())["episodes"]
@@ -114,14 +118,14 @@ def candidates_per_s(name: str, learner: Path, motions: list[np.ndarray], base: 
 
 def row(options: argparse.Namespace, name: str) -> Row:
     work, demonstrations = Path(options.work).absolute(), Path(options.demonstrations)
-    learner, out = with_speeds(options.folder, name).absolute(), work / f"out_{name}"
+    learner, out, cache = with_speeds(options.folder, name).absolute(), work / f"out_{name}", work / f"cache_{name}"
     recordings = write_episodes(work / "recordings.hdf5", demonstrations, 1)
     while len(recordings) < len(TASKS):  # each once
         recordings = write_episodes(work / "recordings.hdf5", demonstrations, sum(map(len, recordings)) + 1)
     motions = write_episodes(work / "episodes.hdf5", demonstrations, options.frames)
-    of_command = command(work / "recordings.hdf5", learner, out)
+    of_command = command(work / "recordings.hdf5", learner, out, cache)
     for _ in range(2):  # the first time compiles
-        timed = whole(work / "episodes.hdf5", learner, out, of_command["base"])
+        timed = whole(work / "episodes.hdf5", learner, out, cache, of_command["base"])
     rate = [candidates_per_s(name, learner, motions, of_command["base"]) for _ in range(2)][1]
     return as_numbers({"learner": name, **timed, "candidates_per_s": rate, "cores": os.cpu_count(), **of_command})
 

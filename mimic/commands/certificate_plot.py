@@ -31,9 +31,13 @@ def plot_certificates(certificates: Mapping[str, Certificate], dt: float, out: P
     )
     figure, axes = plt.subplots(2, 2, figsize=(10, 6), sharex=True, layout="constrained")
     for axis, (label, values, bound, is_logarithmic) in zip(axes.ravel(), panels, strict=True):
-        for item in certificates.values():
-            shown = np.maximum(values(item), 1e-6) if is_logarithmic else values(item)
-            axis.plot(dt * np.arange(len(shown)), shown, color=_COLOURS[item.is_ok], lw=0.7, alpha=0.6)
+        for is_ok, colour in _COLOURS.items():
+            own = [np.append(values(item), np.nan) for item in certificates.values() if item.is_ok == is_ok]
+            time = [dt * np.arange(len(shown)) for shown in own]
+            if own:  # one line, which is interrupted after each episode
+                shown = np.concatenate(own)
+                shown = np.maximum(shown, 1e-6) if is_logarithmic else shown
+                axis.plot(np.concatenate(time), shown, color=colour, lw=0.7, alpha=0.6)
         axis.axhline(bound, color="black", lw=0.8, ls="--")
         axis.set_yscale("log" if is_logarithmic else "linear")
         axis.set_ylabel(label)

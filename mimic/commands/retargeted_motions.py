@@ -78,7 +78,7 @@ def save_motions(
     counts = {-1 if poses is None else poses.shape[1] for poses in objects}
     known = -1 not in counts and len(counts) == 1  # and the same in all episodes
     arrays["objects"] = np.concatenate(objects) if known else np.zeros((len(arrays["time"]), 0, 4, 4))  # type: ignore[arg-type]
-    np.savez_compressed(folder / MOTIONS, **arrays)  # pyright: ignore[reportArgumentType]
+    np.savez(folder / MOTIONS, **arrays)  # pyright: ignore[reportArgumentType]
 
 
 def read_motions(folder: Path) -> RetargetedMotions:

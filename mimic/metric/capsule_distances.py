@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.base import spatial
+from mimic.base.compilation import by_value
 from mimic.control import clearance
 from mimic.control.clearance import ClearanceConstants
 from mimic.metric.kinematics import joint_frames
@@ -39,6 +40,7 @@ def pair_distances(capsules: Capsules, start: Array, end: Array) -> Float[Array,
     return clearance.segment_distances(start[i], end[i], start[j], end[j], jnp, _SMOOTHING) - radii
 
 
+@by_value
 def changing_pairs(arm: Embodiment, capsules: Capsules) -> Bool[np.ndarray, " pairs"]:
     """Whether the joints change the distance of each pair; two capsules of a Panda's wrist are always 2.0 cm apart."""
     qpos = np.random.default_rng(0).uniform(-np.pi, np.pi, (_RANDOM_POSES, arm.num_joints))

@@ -16,9 +16,12 @@ from mimic.retargeting.hand_target import Placement
 
 T = TypeVar("T")
 
-CHUNK = 256  # times
-_ELSEWHERE = 8  # such chunks at once, where these are not on a CPU
 _THREADS = 8  # at most, each with arrays of its own
+
+
+def chunk_size() -> int:
+    """Times of a chunk: more where these are not on a CPU, and a call costs more."""
+    return 256 if compat.is_cpu() else 4096
 
 
 def in_chunks(rows: np.ndarray, size: int, overlap: int = 0) -> Iterator[np.ndarray]:
@@ -32,9 +35,8 @@ def in_chunks(rows: np.ndarray, size: int, overlap: int = 0) -> Iterator[np.ndar
 
 
 def by_chunks(function: Callable[..., Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-    """A function of chunks of rows, for all rows; of larger chunks where a call costs more."""
-    size = CHUNK if compat.is_cpu() else _ELSEWHERE * CHUNK
-    chunks = zip(*(in_chunks(array, size) for array in arrays), strict=True)
+    """A function of chunks of rows, for all rows."""
+    chunks = zip(*(in_chunks(array, chunk_size()) for array in arrays), strict=True)
     results = [function(*chunk) for chunk in chunks]
     return tuple(np.concatenate(jax.device_get(part))[: len(arrays[0])] for part in zip(*results, strict=True))
 
@@ -49,7 +51,7 @@ def in_threads(function: Callable[..., T], *arguments: Sequence[Any]) -> Iterato
 
 @compiled_once
 def hand_report(*arms: Any) -> Callable[..., tuple[Array, Array, Array]]:
-    """The function from CHUNK poses, a placement and angles to distances and errors of the hand [m, rad]."""
+    """The function from poses, a placement and angles to distances and errors of the hand [m, rad]."""
     solver = exact_solver(*arms)
 
     def report(poses: Array, base: Placement, qpos: Array) -> tuple[Array, Array, Array]:

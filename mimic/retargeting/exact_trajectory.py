@@ -19,11 +19,11 @@ from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.link_match import hand_poses
 from mimic.arms.pose_limits import continuous_joints, motion_limits, pose_limits
-from mimic.base.compilation import compiled_once
+from mimic.base.compilation import compiled_once, on_host
 from mimic.metric.distance import Metric
 from mimic.retargeting.costs import NO_COSTS, Costs
 from mimic.retargeting.exact_candidates import INEXACT, PER_METRE, Candidates, candidates_of_motions
-from mimic.retargeting.exact_chunks import CHUNK, by_chunks, hand_report, in_chunks, in_threads
+from mimic.retargeting.exact_chunks import by_chunks, chunk_size, hand_report, in_chunks, in_threads
 from mimic.retargeting.exact_pose import ExactTargets, exact_solver
 from mimic.retargeting.hand_target import (
     HandError,
@@ -39,6 +39,7 @@ from mimic.retargeting.path_smoothing import smoothed
 from mimic.retargeting.pose import PoseImitation, wrap_angles
 from mimic.retargeting.self_motions import past_failing_times
 
+_TIMES = 256  # of the path that are found together
 _STEPS, _DAMPING = 4, 1e-3  # Newton's method from the last time
 _LEAP = 1.001  # of the maximum change: a path that changes by more passes to another branch
 _PER_STEP = 1.0  # distance that a step on the way to another branch costs, of arms that stay exact meanwhile
@@ -107,9 +108,8 @@ def _motion(
         return _Path(qpos, distance, position, rotation, is_exact(position, rotation) & inside)
 
     paths: list[_Path] = []
-    steps = steps_between(candidates.qpos, jump, continuous)
     for cost_of_step in (_PER_STEP, INEXACT) if is_redundant else (INEXACT,):
-        qpos = within_ranges(best_path(candidates, steps, continuous, cost_of_step), ranges)
+        qpos = within_ranges(best_path(candidates, jump, continuous, cost_of_step), ranges)
         if np.any(np.abs(np.diff(qpos, axis=0)) > jump):  # followed as fast as it can be
             qpos = _followed(arms, poses, qpos, base, jump)
         paths.append(judged(qpos))
@@ -128,58 +128,52 @@ def _motion(
     return PoseImitation(qpos, distance, exact, HandError(position, rotation, exact))
 
 
-def steps_between(
-    qpos: Float[np.ndarray, "time candidates joints"], jump: np.ndarray, continuous: np.ndarray
-) -> Float[np.ndarray, "times candidates candidates"]:
-    """For all times but the last: by how many times a change from a candidate to another is late at the next one.
-
-    Args:
-      qpos: of candidates at each time [rad].
-      jump: maximum change of each joint from one time to the next [rad].
-      continuous: joints whose full revolutions do not count.
-    """
-    steps = _steps_between(continuous)
-    chunks = [np.asarray(steps(chunk, jump)) for chunk in in_chunks(qpos, CHUNK + 1, 1)]
-    return np.concatenate(chunks)[: len(qpos) - 1]
-
-
-@compiled_once
-def _steps_between(continuous: np.ndarray) -> Callable[[Array, Array], Array]:
-    """The function from candidates at CHUNK + 1 times and the maximum change to what `steps_between` returns."""
-
-    def steps(qpos: Array, jump: Array) -> Array:
-        apart = jnp.abs(wrap_angles(qpos[1:, None] - qpos[:-1, :, None], continuous))
-        return jnp.maximum(jnp.ceil((apart / jump).max(axis=-1)) - 1, 0)
-
-    return steps
-
-
 def best_path(
-    candidates: Candidates,
-    steps: Float[np.ndarray, "times candidates candidates"],
-    continuous: np.ndarray,
-    cost_of_step: float,
+    candidates: Candidates, jump: Float[np.ndarray, " joints"], continuous: np.ndarray, cost_of_step: float
 ) -> Float[np.ndarray, "time joints"]:
     """The candidates with the minimum sum of costs, and of steps on the way to others, by dynamic programming.
 
     Args:
       candidates: at each time.
-      steps: see `steps_between`.
+      jump: maximum change of each joint from one time to the next [rad].
       continuous: joints whose full revolutions do not count.
       cost_of_step: for each time by which a change takes longer than the next time.
     """
-    qpos, cost = candidates
-    total, before, every = cost[0], [], np.arange(cost.shape[1])
-    for of_step, own in zip(np.swapaxes(cost_of_step * steps, 1, 2), cost[1:], strict=True):
-        through = of_step + total  # [to, from]
-        before.append(through.argmin(axis=1))
-        total = own + through[every, before[-1]]
-    index = [int(total.argmin())]
-    for row in reversed(before):
-        index.append(int(row[index[-1]]))
-    path = qpos[np.arange(len(qpos)), index[::-1]]
+    advance, totals, before = _advance(continuous), [candidates.cost[:1]], []
+    with on_host():  # time by time, which takes longer to start elsewhere than to compute here
+        for qpos, cost in zip(*(in_chunks(part, _TIMES + 1, 1) for part in candidates), strict=True):
+            results = advance(totals[-1][-1], qpos, cost[1:], jump, cost_of_step)
+            for part, result in zip((totals, before), results, strict=True):
+                part.append(np.asarray(result))
+    last = len(candidates.cost) - 1
+    index, through = [int(np.concatenate(totals)[last].argmin())], np.concatenate(before)
+    for time in reversed(range(last)):
+        index.append(int(through[time, index[-1]]))
+    path = candidates.qpos[np.arange(last + 1), index[::-1]]
     change = wrap_angles(np.diff(path, axis=0), continuous)
     return np.concatenate([path[:1], path[0] + np.cumsum(change, axis=0)])
+
+
+@compiled_once
+def _advance(continuous: np.ndarray) -> Callable[..., tuple[Array, Array]]:
+    """The function that `best_path` calls for the times of a chunk, one after the other.
+
+    It is from the sums of costs at a time, the candidates there and later, costs later, the maximum change and the cost
+    of a step to the sums at the later times, and the candidates before these.
+    """
+
+    def advance(total: Array, qpos: Array, cost: Array, jump: Array, cost_of_step: Array) -> tuple[Array, Array]:
+        def step(total: Array, now: tuple[Array, Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+            before, qpos, cost = now
+            apart = jnp.abs(wrap_angles(qpos[:, None] - before, continuous))  # [to, from]
+            late = jnp.maximum(jnp.ceil((apart / jump).max(axis=-1)) - 1, 0)
+            through = total + cost_of_step * late
+            total = cost + through.min(axis=1)
+            return total, (total, through.argmin(axis=1))
+
+        return jax.lax.scan(step, total, (qpos[:-1], qpos[1:], cost))[1]
+
+    return advance
 
 
 def within_ranges(
@@ -196,7 +190,7 @@ def _followed(
 ) -> np.ndarray:
     """A path as fast as the maximum change allows."""
     follow, last, chunks = _follower(*arms), path[0].astype(np.float32), []
-    for of_expert, of_path in zip(in_chunks(poses, CHUNK), in_chunks(path, CHUNK), strict=True):
+    for of_expert, of_path in zip(in_chunks(poses, chunk_size()), in_chunks(path, chunk_size()), strict=True):
         chunks.append(np.asarray(follow(of_expert, base, of_path, last, jump)))
         last = chunks[-1][-1]
     return np.concatenate(chunks)[: len(path)]
@@ -204,7 +198,7 @@ def _followed(
 
 @compiled_once
 def _follower(*arms: Any) -> Callable[..., Array]:
-    """The function from CHUNK poses, a placement, a path, the angles before it and the maximum change to angles.
+    """The function from poses, a placement, a path, the angles before it and the maximum change to angles.
 
     Each time is solved from three fractions of the way to the path; of those with an exact hand the farthest is taken.
     An arm that is not redundant has none of these on its way to another branch and goes straight.

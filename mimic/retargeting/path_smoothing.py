@@ -94,7 +94,7 @@ def least_change(
 
 @compiled_once
 def _back_to_the_hand(*arms: Any) -> Callable[..., tuple[Array, ...]]:
-    """The function from CHUNK poses, a placement and angles to angles with an exact hand.
+    """The function from poses, a placement and angles to angles with an exact hand.
 
     It also returns whether the hand was exact and is, and its stiffness.
     """

@@ -1,7 +1,6 @@
 """Motions in which links touch each other or the floor."""
 
-import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import mujoco
 import numpy as np
@@ -41,26 +40,29 @@ def make_contacts(
     Raises:
       ValueError: what `build_arm` rejects.
     """
-    arm, model = build_arm(config, limits), arm_spec(config).compile()
-    start = data_at_zero(model)
-    for name, angle in arm.locked.items():
-        start.qpos[model.joint(name).qposadr[0]] = angle
-    address = np.array([model.joint(name).qposadr[0] for name in arm.embodiment.joint_names])
+    arm, spec = build_arm(config, limits), arm_spec(config)
 
-    def touching(qpos: np.ndarray, data: mujoco.MjData) -> set[tuple[int, int]]:
-        data.qpos[address] = qpos
-        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_collision):  # what collisions need
-            compute(model, data)
-        pairs = model.geom_bodyid[data.contact.geom[data.contact.dist < 0]]
-        return set(map(tuple, pairs.tolist()))
+    def touching(model: mujoco.MjModel, poses: np.ndarray) -> Iterator[np.ndarray]:
+        """Pairs of geoms that touch in each pose."""
+        data = data_at_zero(model)
+        for name, angle in arm.locked.items():
+            data.qpos[model.joint(name).qposadr[0]] = angle
+        address = np.array([model.joint(name).qposadr[0] for name in arm.embodiment.joint_names])
+        for pose in poses:
+            data.qpos[address] = pose
+            for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_collision):  # what collisions need
+                compute(model, data)
+            yield data.contact.geom[data.contact.dist < 0] if data.ncon else _NOTHING
 
-    always = touching(np.asarray(arm.embodiment.home, float), start)
-
-    def contacts(qpos: np.ndarray) -> np.ndarray:
-        data = copy.copy(start)  # each thread has its own
-        return np.array([bool(touching(pose, data) - always) for pose in qpos], bool)
-
-    return contacts
+    model = spec.compile()
+    (always,) = touching(model, np.asarray(arm.embodiment.home, float)[None])
+    names = {}
+    for body in spec.bodies:
+        body.name = names[body.id] = body.name or f"body {body.id} of {len(spec.bodies)}"
+    for one, other in {tuple(sorted(bodies)) for bodies in model.geom_bodyid[always].tolist()}:
+        spec.add_exclude(bodyname1=names[one], bodyname2=names[other])
+    others = spec.compile() if len(always) else model
+    return lambda qpos: np.array([len(pairs) > 0 for pairs in touching(others, qpos)], bool)
 
 
 def touching_line(clearances: Float[np.ndarray, " motions"], noun: str = "demonstrations") -> str:
@@ -76,3 +78,4 @@ def touching_line(clearances: Float[np.ndarray, " motions"], noun: str = "demons
 
 
 _SHOWN = 8  # numbers of motions
+_NOTHING = np.zeros((0, 2), int)

@@ -18,7 +18,7 @@ from mimic.retargeting.base_placement import find_base, repeated
 from mimic.retargeting.costs import NO_COSTS
 from mimic.retargeting.exact_candidates import Candidates, candidates_of_motions
 from mimic.retargeting.exact_chunks import in_chunks
-from mimic.retargeting.exact_trajectory import best_path, steps_between, within_ranges
+from mimic.retargeting.exact_trajectory import best_path, within_ranges
 from mimic.retargeting.hand_speeds import speeds_needed
 from mimic.retargeting.hand_target import (
     POSITION_TOLERANCE,
@@ -185,26 +185,34 @@ def test_the_best_path_leaves_a_branch_only_where_that_pays():
     """Two branches 1 rad apart, each better by 1 in one half; ten steps lie between them."""
     late = (np.arange(40) >= 20).astype(float)
     candidates = Candidates(np.array([0.0, 1.0])[None, :, None] * np.ones((40, 1, 1)), np.stack([late, 1 - late], 1))
-    steps = steps_between(candidates.qpos.astype(np.float32), np.array([0.1], np.float32), NEVER)
-    np.testing.assert_array_equal(best_path(candidates, steps, NEVER, 1.9)[:, 0], late)
-    assert len(np.unique(best_path(candidates, steps, NEVER, 2.5))) == 1
+    candidates, jump = candidates._replace(qpos=candidates.qpos.astype(np.float32)), np.array([0.1], np.float32)
+    np.testing.assert_array_equal(best_path(candidates, jump, NEVER, 1.9)[:, 0], late)
+    assert len(np.unique(best_path(candidates, jump, NEVER, 2.5))) == 1
 
 
-@pytest.mark.parametrize("count", [2, 256, 257, 700])
-def test_steps_to_a_candidate_are_the_times_that_it_is_late(count):
-    qpos = np.random.default_rng(0).uniform(-3, 3, (count, 2, 2)).astype(np.float32)
-    jump, continuous = np.array([0.5, 0.2], np.float32), np.array([True, False])
-    apart = qpos[1:, None] - qpos[:-1, :, None]
+@pytest.mark.parametrize("count", [1, 2, 256, 257, 258, 700])
+def test_no_path_is_better_than_the_best(count):
+    """Against dynamic programming by NumPy, of random candidates of a continuous joint and one that is not."""
+    rng, jump, continuous = np.random.default_rng(0), np.array([0.5, 0.2], np.float32), np.array([True, False])
+    qpos, cost = rng.uniform(-3, 3, (count, 5, 2)).astype(np.float32), rng.uniform(0, 20, (count, 5)).astype(np.float32)
+    apart = qpos[1:, None] - qpos[:-1, :, None]  # [time, from, to, joints]
     apart[..., 0] = (apart[..., 0] + np.pi) % (2 * np.pi) - np.pi
     late = np.maximum(np.ceil(np.abs(apart / jump).max(axis=-1)) - 1, 0)
-    steps = steps_between(qpos, jump, continuous)
-    assert steps.shape == (count - 1, 2, 2)
-    assert np.mean(steps == late) > 0.999  # angles at a whole number of steps may round either way
+    total = cost[0]
+    for steps, own in zip(late, cost[1:], strict=True):
+        total = own + (total[:, None] + 1.5 * steps).min(axis=0)
+    path = best_path(Candidates(qpos, cost), jump, continuous, 1.5)
+    differs = np.abs(path[:, None] - qpos)
+    differs[..., 0] = np.abs((differs[..., 0] + np.pi) % (2 * np.pi) - np.pi)
+    chosen, times = differs.max(axis=-1).argmin(axis=1), np.arange(count)
+    assert differs.max(axis=-1)[times, chosen].max() < 1e-3
+    reached = cost[times, chosen].sum() + 1.5 * late[times[:-1], chosen[:-1], chosen[1:]].sum()
+    assert reached == pytest.approx(total.min(), abs=2)  # angles at a whole number of steps may round either way
 
 
 @pytest.mark.slow
 def test_candidates_of_many_motions_at_once_are_those_of_each(monkeypatch):
-    """As on a GPU, where the chunks of all motions are one batch, beside one chunk after another."""
+    """As on a GPU, where a chunk has the times of many motions, beside one motion after another."""
     metric, lengths = MetricConfig().build(EXPERT, EXPERT), (300, 40, 513)
     motions = [0.3 * np.sin(np.arange(n)[:, None] / 30 + np.arange(3)).astype(np.float32) for n in lengths]
     arms, jump = (EXPERT, EXPERT, metric, NO_COSTS, None), np.full(3, 0.1, np.float32)
