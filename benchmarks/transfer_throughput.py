@@ -85,8 +85,8 @@ def whole(source: Path, learner: Path, out: Path, cache: Path, base: list[float]
     shutil.rmtree(out, ignore_errors=True)
     env = EnvConfig(expert=ArmConfig(model="panda"), learner=ArmConfig(model=str(learner)))
     began, cpu = time.perf_counter(), time.process_time()
-    files = {"source": str(source), "out": str(out), "compilation_cache": str(cache)}
-    work = prepare_retargeting(RetargetConfig(env=env, base=base, failing="kept", **files))
+    keys = RetargetConfig(str(source), env=env, out=str(out), base=base, failing="kept", compilation_cache=str(cache))
+    work = prepare_retargeting(keys)
     assert work() == 0
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     episodes = json.loads((out / "report.json").read_text())["episodes"]

@@ -204,7 +204,8 @@ def _leaf_key(leaf: Any) -> Hashable:
 
 def _quick_options(options: Mapping[str, Any] = _QUICK_CPU_OPTIONS) -> dict[str, Any]:
     """XLA's options for a function that compiles quickly on a CPU, without those that XLA_FLAGS sets."""
-    if jax.default_backend() != "cpu":
+    device = jax.config.values["jax_default_device"] or jax.default_backend()
+    if getattr(device, "platform", device) != "cpu":
         return {}
     return _without_those_of_user(dict(options))
 

@@ -23,7 +23,7 @@ from mimic.base.compilation import compiled_once, on_host
 from mimic.metric.distance import Metric
 from mimic.retargeting.costs import NO_COSTS, Costs
 from mimic.retargeting.exact_candidates import INEXACT, PER_METRE, Candidates, candidates_of_motions
-from mimic.retargeting.exact_chunks import by_chunks, chunk_size, hand_report, in_chunks, in_threads
+from mimic.retargeting.exact_chunks import by_chunks, hand_report, in_chunks, in_threads
 from mimic.retargeting.exact_pose import ExactTargets, exact_solver
 from mimic.retargeting.hand_target import (
     HandError,
@@ -39,7 +39,9 @@ from mimic.retargeting.path_smoothing import smoothed
 from mimic.retargeting.pose import PoseImitation, wrap_angles
 from mimic.retargeting.self_motions import past_failing_times
 
-_TIMES = 256  # of the path that are found together
+_TIMES = (
+    256  # of a call of what goes from time to time, on the host: elsewhere a step takes longer to start than to run
+)
 _STEPS, _DAMPING = 4, 1e-3  # Newton's method from the last time
 _LEAP = 1.001  # of the maximum change: a path that changes by more passes to another branch
 _PER_STEP = 1.0  # distance that a step on the way to another branch costs, of arms that stay exact meanwhile
@@ -139,8 +141,9 @@ def best_path(
       continuous: joints whose full revolutions do not count.
       cost_of_step: for each time by which a change takes longer than the next time.
     """
-    advance, totals, before = _advance(continuous), [candidates.cost[:1]], []
-    with on_host():  # time by time, which takes longer to start elsewhere than to compute here
+    totals, before = [candidates.cost[:1]], []
+    with on_host():
+        advance = _advance(continuous)
         for qpos, cost in zip(*(in_chunks(part, _TIMES + 1, 1) for part in candidates), strict=True):
             results = advance(totals[-1][-1], qpos, cost[1:], jump, cost_of_step)
             for part, result in zip((totals, before), results, strict=True):
@@ -189,10 +192,12 @@ def _followed(
     arms: tuple[Any, ...], poses: np.ndarray, path: np.ndarray, base: Placement, jump: np.ndarray
 ) -> np.ndarray:
     """A path as fast as the maximum change allows."""
-    follow, last, chunks = _follower(*arms), path[0].astype(np.float32), []
-    for of_expert, of_path in zip(in_chunks(poses, chunk_size()), in_chunks(path, chunk_size()), strict=True):
-        chunks.append(np.asarray(follow(of_expert, base, of_path, last, jump)))
-        last = chunks[-1][-1]
+    last, chunks = path[0].astype(np.float32), []
+    with on_host():
+        follow = _follower(*arms)
+        for of_expert, of_path in zip(in_chunks(poses, _TIMES), in_chunks(path, _TIMES), strict=True):
+            chunks.append(np.asarray(follow(of_expert, base, of_path, last, jump)))
+            last = chunks[-1][-1]
     return np.concatenate(chunks)[: len(path)]
 
 

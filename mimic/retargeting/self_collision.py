@@ -1,17 +1,28 @@
 """Motions in which links touch each other or the floor."""
 
-from collections.abc import Callable, Iterator
+import copy
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
+from mujoco.rollout import Rollout
 
-from mimic.arms.arm import ArmConfig, arm_spec, build_arm
+from mimic.arms.arm import Arm, ArmConfig, arm_spec, build_arm
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.mujoco_chain import data_at_zero
 from mimic.control.clearance import clearance
 from mimic.metric.capsule_distances import clearance_constants
+
+_SENSOR = "contacts of any geoms"
+_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+_TIME = 1  # numbers of a state before its qpos
+_OFF = mujoco.mjtDisableBit
+_NO_FORCES = (  # of a step, whose contacts alone count
+    _OFF.mjDSBL_ACTUATION | _OFF.mjDSBL_AUTORESET | _OFF.mjDSBL_DAMPER | _OFF.mjDSBL_EQUALITY
+    | _OFF.mjDSBL_FRICTIONLOSS | _OFF.mjDSBL_GRAVITY | _OFF.mjDSBL_LIMIT | _OFF.mjDSBL_SPRING
+)  # fmt: skip
 
 
 def smallest_clearances(
@@ -41,28 +52,49 @@ def make_contacts(
       ValueError: what `build_arm` rejects.
     """
     arm, spec = build_arm(config, limits), arm_spec(config)
-
-    def touching(model: mujoco.MjModel, poses: np.ndarray) -> Iterator[np.ndarray]:
-        """Pairs of geoms that touch in each pose."""
-        data = data_at_zero(model)
-        for name, angle in arm.locked.items():
-            data.qpos[model.joint(name).qposadr[0]] = angle
-        address = np.array([model.joint(name).qposadr[0] for name in arm.embodiment.joint_names])
-        for pose in poses:
-            data.qpos[address] = pose
-            for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_collision):  # what collisions need
-                compute(model, data)
-            yield data.contact.geom[data.contact.dist < 0] if data.ncon else _NOTHING
-
     model = spec.compile()
-    (always,) = touching(model, np.asarray(arm.embodiment.home, float)[None])
+    data, address = _at_rest(model, arm)
+    data.qpos[address] = arm.embodiment.home
+    mujoco.mj_fwdPosition(model, data)
     names = {}
     for body in spec.bodies:
         body.name = names[body.id] = body.name or f"body {body.id} of {len(spec.bodies)}"
-    for one, other in {tuple(sorted(bodies)) for bodies in model.geom_bodyid[always].tolist()}:
+    touching = model.geom_bodyid[data.contact.geom[data.contact.dist < 0]]
+    for one, other in {tuple(sorted(pair)) for pair in touching.tolist()}:
         spec.add_exclude(bodyname1=names[one], bodyname2=names[other])
-    others = spec.compile() if len(always) else model
-    return lambda qpos: np.array([len(pairs) > 0 for pairs in touching(others, qpos)], bool)
+    # A sensor that counts contacts of any geoms: MuJoCo then computes a motion without Python's lock.
+    any_geom = mujoco.mjtObj.mjOBJ_UNKNOWN
+    data_field, no_reduction, one_slot = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1
+    spec.add_sensor(
+        name=_SENSOR, type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=any_geom, reftype=any_geom,
+        intprm=[data_field, no_reduction, one_slot],
+    )  # fmt: skip
+    model = spec.compile()
+    model.geom_margin[:] = model.pair_margin[:] = 0.0
+    model.opt.disableflags = _NO_FORCES
+    start, address = _at_rest(model, arm)
+    state = np.zeros(mujoco.mj_stateSize(model, _STATE))
+    mujoco.mj_getState(model, start, state, _STATE)
+    column = model.sensor(_SENSOR).adr[0]
+
+    def contacts(qpos: np.ndarray) -> np.ndarray:
+        if not len(qpos):  # MuJoCo does not expect that
+            return np.zeros(0, bool)
+        states = np.tile(state, (len(qpos), 1))
+        states[:, _TIME + address] = qpos
+        with Rollout(nthread=1) as rollout:
+            sensors = rollout.rollout(model, [copy.copy(start)], states, nstep=1)[1]
+        return sensors[:, 0, column] > 0
+
+    return contacts
+
+
+def _at_rest(model: mujoco.MjModel, arm: Arm) -> tuple[mujoco.MjData, np.ndarray]:
+    """The model in its zero pose with locked joints at their angles, and where in qpos the arm's joints are."""
+    data = data_at_zero(model)
+    for name, angle in arm.locked.items():
+        data.qpos[model.joint(name).qposadr[0]] = angle
+    return data, np.array([model.joint(name).qposadr[0] for name in arm.embodiment.joint_names])
 
 
 def touching_line(clearances: Float[np.ndarray, " motions"], noun: str = "demonstrations") -> str:
@@ -78,4 +110,3 @@ def touching_line(clearances: Float[np.ndarray, " motions"], noun: str = "demons
 
 
 _SHOWN = 8  # numbers of motions
-_NOTHING = np.zeros((0, 2), int)

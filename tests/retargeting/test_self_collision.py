@@ -47,6 +47,9 @@ def test_contacts_are_those_of_the_models_own_shapes(tmp_path):
     contacts = make_contacts(ArmConfig(model=str(tmp_path / "arm.xml")))
     folded, passing = [0.0, 2.0, 2.3], [0.0, np.pi / 2, np.pi / 2]  # the third box lies across the first, or beside it
     assert contacts(np.array([[0.0, 0.0, 0.0], folded, passing])).tolist() == [False, True, False]
+    assert contacts(np.zeros((0, 3))).shape == (0,)
+    at_home = make_contacts(ArmConfig(model=str(tmp_path / "arm.xml"), home=folded))
+    assert at_home(np.array([folded, passing])).tolist() == [False, False]  # what touches in the home pose is left out
 
 
 def _counts(model, contact, pairs) -> bool:
