@@ -40,7 +40,6 @@ def pair_distances(capsules: Capsules, start: Array, end: Array) -> Float[Array,
     return clearance.segment_distances(start[i], end[i], start[j], end[j], jnp, _SMOOTHING) - radii
 
 
-@by_value
 def changing_pairs(arm: Embodiment, capsules: Capsules) -> Bool[np.ndarray, " pairs"]:
     """Whether the joints change the distance of each pair; two capsules of a Panda's wrist are always 2.0 cm apart."""
     qpos = np.random.default_rng(0).uniform(-np.pi, np.pi, (_RANDOM_POSES, arm.num_joints))
@@ -49,6 +48,7 @@ def changing_pairs(arm: Embodiment, capsules: Capsules) -> Bool[np.ndarray, " pa
     return np.ptp(clearance.pair_distances(*axes, constants), axis=0) > _CHANGE
 
 
+@by_value
 def colliding_pairs(arm: Embodiment, capsules: Capsules) -> list[tuple[int, int]]:
     """The capsules' pairs whose distance the joints change."""
     changes = changing_pairs(arm, capsules)

@@ -26,7 +26,6 @@ from mimic.retargeting.exact_candidates import INEXACT, PER_METRE, Candidates, c
 from mimic.retargeting.exact_chunks import by_chunks, hand_report, in_chunks, in_threads
 from mimic.retargeting.exact_pose import ExactTargets, exact_solver
 from mimic.retargeting.hand_target import (
-    HandError,
     Placement,
     hand_cost_derivatives,
     is_exact,
@@ -36,7 +35,7 @@ from mimic.retargeting.hand_target import (
 from mimic.retargeting.initial_guesses import RandomPoses
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, newton
 from mimic.retargeting.path_smoothing import smoothed
-from mimic.retargeting.pose import PoseImitation, wrap_angles
+from mimic.retargeting.pose import wrap_angles
 from mimic.retargeting.self_motions import past_failing_times
 
 _TIMES = (
@@ -49,7 +48,7 @@ _FRACTIONS = 1.0, 0.5, 0.0  # of the way to the path in a step
 _POSITION_FIRST = 1e-3  # weight of the rotation of a hand that is not exact
 
 
-class _Path(NamedTuple):
+class ExactPath(NamedTuple):
     """Angles [rad], distances and errors of the hand [m, rad] of a path, and when it is exact within the limits."""
 
     qpos: np.ndarray
@@ -73,7 +72,7 @@ def exact_trajectories(
     random: RandomPoses,
     costs: Costs = NO_COSTS,
     capsules: Capsules | None = None,
-) -> Iterator[PoseImitation]:
+) -> Iterator[ExactPath]:
     """The motion for each of the expert; see `imitate_trajectory`.
 
     Raises:
@@ -84,15 +83,15 @@ def exact_trajectories(
     arms = expert, learner, metric, costs, capsules
     candidates = candidates_of_motions(arms, motions, base, jump, random)
 
-    def motion(poses: np.ndarray, candidates: Candidates) -> PoseImitation:
-        return jax.block_until_ready(_motion(arms, poses, base, jump, candidates))
+    def motion(poses: np.ndarray, candidates: Candidates) -> ExactPath:
+        return _motion(arms, poses, base, jump, candidates)
 
     yield from in_threads(motion, motions, candidates)
 
 
 def _motion(
     arms: tuple[Any, ...], poses: np.ndarray, base: Placement, jump: np.ndarray, candidates: Candidates
-) -> PoseImitation:
+) -> ExactPath:
     """The motion through candidates; see the head of this file."""
     expert, learner, *_ = arms
     continuous, ranges = continuous_joints(learner), np.asarray(learner.joint_range)
@@ -102,14 +101,14 @@ def _motion(
     is_redundant = learner.num_joints > 6 * len(learner.hand_joint)
     lower, upper = motion_limits(learner)
 
-    def judged(qpos: np.ndarray) -> _Path:
+    def judged(qpos: np.ndarray) -> ExactPath:
         """The path, smoothed where the arm is redundant."""
         qpos = smoothed(arms, poses, qpos, base, jump) if is_redundant else qpos
         distance, position, rotation = by_chunks(lambda x, qpos: report(x, base, qpos), poses, qpos)
         inside = np.all((qpos >= lower - 1e-6) & (qpos <= upper + 1e-6), axis=-1)
-        return _Path(qpos, distance, position, rotation, is_exact(position, rotation) & inside)
+        return ExactPath(qpos, distance, position, rotation, is_exact(position, rotation) & inside)
 
-    paths: list[_Path] = []
+    paths: list[ExactPath] = []
     for cost_of_step in (_PER_STEP, INEXACT) if is_redundant else (INEXACT,):
         qpos = within_ranges(best_path(candidates, jump, continuous, cost_of_step), ranges)
         if np.any(np.abs(np.diff(qpos, axis=0)) > jump):  # followed as fast as it can be
@@ -117,7 +116,7 @@ def _motion(
         paths.append(judged(qpos))
         if paths[-1].exact.all():  # and, with the lower cost, of the lower distance
             break
-    best = max(paths, key=_Path.order)
+    best = max(paths, key=ExactPath.order)
     if is_redundant and not best.exact.all():
         chosen, possible = matched_hands(expert, learner), candidates.cost < INEXACT
         hands = placed_hands(base, hand_poses(expert, poses)[:, chosen[:, 0]])
@@ -125,9 +124,8 @@ def _motion(
         other = past_failing_times(
             learner, chosen[:, 1], hands, best.qpos, best.exact, jump, possible.any(axis=1), starts
         )
-        best = max(best, judged(other), key=_Path.order)
-    qpos, distance, position, rotation, exact = map(jnp.asarray, best)
-    return PoseImitation(qpos, distance, exact, HandError(position, rotation, exact))
+        best = max(best, judged(other), key=ExactPath.order)
+    return best
 
 
 def best_path(

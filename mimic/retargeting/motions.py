@@ -94,8 +94,8 @@ def retarget_motions(
         random = random_poses(learner, key, STARTS["exact"], np.float32, SET)
         arguments = placement(base), jump, random, costs, capsules if costs.of_capsules else None
         poses = [np.asarray(qpos, np.float32) for qpos in motions]
-        for solution in exact_trajectories(expert, learner, built, poses, *arguments):
-            yield np.asarray(solution.qpos, float)
+        for path in exact_trajectories(expert, learner, built, poses, *arguments):
+            yield np.asarray(path.qpos, float)
         return
 
     def scaled(qpos: np.ndarray) -> np.ndarray:  # padded, so that motions of similar lengths share what is compiled

@@ -22,7 +22,7 @@ from mimic.retargeting.closed_form import ROUGH_SMOOTHING
 from mimic.retargeting.costs import Costs, smoothness_derivatives, sum_of, with_costs
 from mimic.retargeting.exact_pose import SET
 from mimic.retargeting.exact_trajectory import exact_trajectories
-from mimic.retargeting.hand_target import placement
+from mimic.retargeting.hand_target import HandError, placement
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
 from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, Store, newton
 from mimic.retargeting.pose import (
@@ -113,7 +113,9 @@ def imitate_trajectory(
         motion, limit = np.asarray(poses, np.float32), np.asarray(jump, np.float32)
         random = random_poses(learner, key, max(starts, 1), np.float32, SET)
         arguments = placement(base), limit, random, costs, capsules
-        return next(exact_trajectories(expert, learner, metric, [motion], *arguments))
+        (path,) = exact_trajectories(expert, learner, metric, [motion], *arguments)
+        qpos, distance, position, angle, exact = map(jnp.asarray, path)
+        return PoseImitation(qpos, distance, exact, HandError(position, angle, exact))
     solve = _trajectory_solver(expert, learner, metric, bool(starts), costs, capsules)
     return solve(poses, jump, random_poses(learner, key, max(starts, 1), poses.dtype))
 
