@@ -4,7 +4,7 @@ import statistics
 from collections.abc import Callable
 from typing import Any
 
-from benchmarks.common.cells import MEASURES, Cells, Results, one, percent, span, where
+from benchmarks.common.cells import MEASURES, Cells, Results, device, one, percent, span, where
 
 # Any arm
 
@@ -221,12 +221,13 @@ def transfers(results: Results, *replays: Results) -> list[Cells]:
 
 def transfer_speeds(*measured: Results) -> list[Cells]:
     """How fast data sets are retargeted, by compiled functions and by a command without a compilation cache."""
-    header = "arm", "frames", "exact", "frames/s", "command, without compiled functions"
+    header = "arm", "on", "frames", "exact", "frames/s", "command, without compiled functions"
     rows: list[Cells] = [header]
-    for row in (row for results in measured for row in results["rows"]):
-        frames, speed = (f"{row[key]:,.0f}" for key in ("frames", "frames_per_s"))
-        command = f"{row['command_s']:.0f} s for {row['command_frames']:,} frames"
-        rows.append((row["learner"], frames, percent(row["exact"]), speed, command))
+    for results in measured:
+        for row in results["rows"]:
+            frames, speed = (f"{row[key]:,.0f}" for key in ("frames", "frames_per_s"))
+            command = f"{row['command_s']:.0f} s for {row['command_frames']:,} frames"
+            rows.append((row["learner"], device(results), frames, percent(row["exact"]), speed, command))
     return rows
 
 

@@ -28,6 +28,12 @@ def span(values: Sequence[float], form: str = ".2f", factor: float = 100) -> str
     return low if low == high else f"{low} to {high}"
 
 
+def device(results: Results) -> str:
+    """What a results file was measured on."""
+    hardware = results["hardware"]
+    return f"{hardware['cpu_cores']} cores" if hardware["backend"] == "cpu" else hardware["device"]
+
+
 def percent(value: float, form: str = ".2f") -> str:
     """A fraction in percent."""
     return format(100 * value, form) + " %"

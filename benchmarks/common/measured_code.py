@@ -7,7 +7,7 @@ import tokenize
 from collections.abc import Mapping
 from pathlib import Path
 
-from benchmarks.common.cells import Cells, Results
+from benchmarks.common.cells import Cells, Results, device
 
 PACKAGE = Path(__file__).resolve().parents[2] / "mimic"
 # Folders of the package that numbers depend on, each above those that it imports, see tests/test_layers.py.
@@ -37,12 +37,11 @@ def changed_code(files: Mapping[str, Results]) -> list[Cells]:
     """The table of all results files: what they were measured on, and which folders have changed since."""
     rows: list[Cells] = [("file", "commit", "date", "hardware", "changed since")]
     for path, results in files.items():
-        commit, hardware = results["commit"].partition(" ")[0][:8], results["hardware"]
-        device = f"{hardware['cpu_cores']} cores" if hardware["backend"] == "cpu" else hardware["device"]
+        commit = results["commit"].partition(" ")[0][:8]
         now, name = hashes(results["benchmark"]), Path(path).name
         changed = [folder for folder in now if results.get("code", {}).get(folder) != now[folder]]
         text = "everything" if len(changed) == len(now) else ", ".join(changed) or "nothing"
-        rows.append((f"[{name}]({name})", commit, results["date"][:10], device, text))
+        rows.append((f"[{name}]({name})", commit, results["date"][:10], device(results), text))
     return rows
 
 
