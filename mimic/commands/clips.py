@@ -22,6 +22,8 @@ from mimic.envs.config import EnvConfig
 from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line_table, similarity
+from mimic.retargeting.certificate import hand_errors
+from mimic.retargeting.hand_target import placement, states_in_base
 from mimic.retargeting.pose import imitate_pose
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.make import make_policy_trainer
@@ -141,8 +143,8 @@ def _data_set_clip(config: RenderConfig) -> ClipPlan:
         time = np.arange(own[0], own[-1] + 1e-9, 1 / FRAMES_PER_SECOND)
         qpos, learner_qpos, poses = (_interpolated(time, own, x) for x in (*values, objects.reshape(len(own), -1)))
         title = f"{Path(config.retargeted).name}, {motions.episodes[config.demonstration]}"
-        clip = _static_clip(env, title, time - time[0], qpos, learner_qpos)
-        return dataclasses.replace(clip, base=motions.base, objects=poses.reshape(len(time), *objects.shape[1:]))
+        clip = _static_clip(env, title, time - time[0], qpos, learner_qpos, motions.base)
+        return dataclasses.replace(clip, objects=poses.reshape(len(time), *objects.shape[1:]))
 
     return ClipPlan(env, None, compute)
 
@@ -176,13 +178,23 @@ def _arm_of(role: str, config: RenderConfig, joints: Sequence[str]) -> ArmConfig
     raise ValueError(f"{role}: expected the arm of the data set, with joints {', '.join(joints)}, got {others[0]}")
 
 
-def _static_clip(env: EnvConfig, title: str, time: np.ndarray, qpos: np.ndarray, learner_qpos: np.ndarray) -> Clip:
-    """A clip of static poses, whose velocities are ignored, with the distance of the optimal pose at each frame."""
+def _static_clip(
+    env: EnvConfig,
+    title: str,
+    time: np.ndarray,
+    qpos: np.ndarray,
+    learner_qpos: np.ndarray,
+    base: Sequence[float] | None,
+) -> Clip:
+    """A clip of static poses, whose velocities are ignored, with the distance of the optimal pose at each frame.
+
+    Where the learner's base is placed, the hands are compared in metres; and without optimal poses if it is turned.
+    """
     expert, learner = env.build_arms().embodiments
-    metric = env.metric.build(expert, learner)
+    metric, place = env.metric.build(expert, learner), placement(base)
 
     def evaluate(qpos: jax.Array, learner_qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
-        states = link_states(expert, qpos), link_states(learner, learner_qpos)
+        states = states_in_base(place, link_states(expert, qpos)), link_states(learner, learner_qpos)
         distances = metric.link_distances(*states)
         by_link = (metric.matrix(distances) * distances).sum(axis=0) / distances.size
         return metric(*states), by_link  # with the hand, which is no link
@@ -190,19 +202,27 @@ def _static_clip(env: EnvConfig, title: str, time: np.ndarray, qpos: np.ndarray,
     evaluate_batch = jax.jit(jax.vmap(evaluate))
     distance, by_link = map(np.asarray, evaluate_batch(qpos, learner_qpos))
     hold = np.asarray(evaluate_batch(qpos, np.broadcast_to(np.asarray(learner.home), learner_qpos.shape))[0])
-    optimum = imitate_pose(expert, learner, qpos.astype(np.float32), kept=None, **metric.arguments)
-    curves = (
+    curves = [
         Curve("holding the start pose", hold, _HOLD),
         Curve("retargeted", distance, {"color": "tab:blue"}),
-        Curve("optimal poses", np.asarray(optimum.distance), _OPTIMUM),
-    )
+    ]
+    if base is None or base[3] == 0:
+        optimum = imitate_pose(expert, learner, qpos.astype(np.float32), kept=None, **metric.arguments)
+        curves.append(Curve("optimal poses", np.asarray(optimum.distance), _OPTIMUM))
     labels = "expert", "learner, retargeted"
     poses = qpos, learner_qpos
-    measures = _similarity((expert, learner), poses)
+    measures = _similarity((expert, learner), poses, place.rotation)
+    if base is not None:
+        position, angle = hand_errors(expert, learner, qpos, learner_qpos, base)
+        del measures["hand_position_error"]  # in chain lengths
+        measures |= {"hand_position_mm": 1e3 * position, "hand_rotation_deg": np.degrees(angle)}
     match = env.metric.match_links(expert, learner)
-    return Clip(title, labels, time, poses, time, curves, by_link, learner.link_names, measures, match)
+    return Clip(title, labels, time, poses, time, tuple(curves), by_link, learner.link_names, measures, match, base)
 
 
-def _similarity(arms: tuple[Embodiment, Embodiment], poses: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
-    """Similarity measures of two arms at each frame."""
-    return similarity(*(centre_line_table(arm, qpos) for arm, qpos in zip(arms, poses, strict=True)))
+def _similarity(
+    arms: tuple[Embodiment, Embodiment], poses: tuple[np.ndarray, np.ndarray], rotation: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
+    """Similarity measures of two arms at each frame, of the expert in axes turned by a rotation."""
+    expert, learner = (centre_line_table(arm, qpos) for arm, qpos in zip(arms, poses, strict=True))
+    return similarity(expert if rotation is None else jax.tree.map(lambda x: x @ rotation, expert), learner)

@@ -276,7 +276,7 @@ def _print(
             f"{item.is_exact.sum()} of {len(item.causes)}",
             _number(1e3 * item.position.max(), 2),
             _number(np.degrees(item.rotation.max()), 2),
-            f"{np.degrees(item.margin.min()):.1f}",
+            _number(np.degrees(item.margin.min()), 1),
             f"{item.speed.max():.0%}",
             _number(1e3 * item.clearance.min(), 0),
         )
@@ -299,7 +299,7 @@ def _print(
 
 def _number(value: float, digits: int) -> str:
     """A cell of the table; what is not known, as of an arm without a hand or without shapes, is a dash."""
-    return "-" if np.isnan(value) else f"{value:.{digits}f}"
+    return "-" if np.isnan(value) else f"{round(value, digits) + 0.0:.{digits}f}"  # 0.0 and not -0.0
 
 
 def _print_lines(console: Console, lines: Sequence[str]) -> None:

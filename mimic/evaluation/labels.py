@@ -12,6 +12,7 @@ SIMILARITY_HEADERS = {  # of tables and pictures; positions in chain lengths
     "hand_position_error": "hand\nposition",
     "hand_rotation_deg": "hand\nrotation",
 }
+_IN_METRES = {"hand_position_mm": "hand\nposition"}  # of arms whose bases are placed
 SPLIT_NAMES = {"train": "training", "held_out": "held out"}
 SIMILARITY_NAMES = {  # display names that differ from their keys
     "nearest_poses": "nearest poses (metric)",
@@ -26,9 +27,11 @@ def similarity_texts(similarity: Mapping[str, float]) -> dict[str, tuple[str, st
     """Label and value of each known measure of one moment by its name, as the viewer and videos show them."""
 
     def text(name: str) -> str:
-        return f"{similarity[name]:.0f}°" if name.endswith("_deg") else f"{similarity[name]:.3f}"
+        value = similarity[name]
+        if name.endswith("_mm"):
+            return f"{value:.0f} mm"
+        return f"{value:.0f}°" if name.endswith("_deg") else f"{value:.3f}"
 
-    known = {
-        name: header for name, header in SIMILARITY_HEADERS.items() if not math.isnan(similarity.get(name, math.nan))
-    }
+    headers = SIMILARITY_HEADERS | _IN_METRES
+    known = {name: header for name, header in headers.items() if not math.isnan(similarity.get(name, math.nan))}
     return {name: (header.replace("\n", " "), text(name)) for name, header in known.items()}

@@ -12,7 +12,7 @@ import mimic
 from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.arms.rendering import ArmScene
 from mimic.commands import render
-from mimic.commands.clips import prepare_clip
+from mimic.commands.clips import _static_clip, prepare_clip
 from mimic.commands.config import RenderConfig
 from mimic.commands.render import _write_video, draw_frames, prepare_video
 from mimic.commands.retargeted_motions import save_motions
@@ -57,6 +57,22 @@ def plan(files):
 
 def curves(clip):
     return {curve.label: curve.values for curve in clip.curves}
+
+
+@pytest.mark.slow
+def test_a_turned_base_counts_in_all_measures():
+    """As the expert turned the other way at its first joint; hands are compared in metres."""
+    env, time = env_config("pair", limits="hardware"), np.arange(3) / 30
+    qpos = np.asarray(env.build_arms().expert.embodiment.home) + np.random.default_rng(0).uniform(-0.3, 0.3, (3, 7))
+    turned = qpos - 0.5 * np.eye(7)[0]
+    placed = _static_clip(env, "", time, qpos, 0.9 * qpos, [0.1, 0.0, 0.0, 0.5])
+    same = _static_clip(env, "", time, turned, 0.9 * qpos, [0.0, 0.0, 0.0, 0.0])
+    assert "optimal poses" in curves(same) and "optimal poses" not in curves(placed)
+    np.testing.assert_allclose(curves(placed)["retargeted"], curves(same)["retargeted"], atol=1e-4)
+    for name in ("centre_line_distance", "tangent_angle_deg", "frechet_distance", "hand_rotation_deg"):
+        np.testing.assert_allclose(placed.similarity[name], same.similarity[name], atol=1e-3)
+    apart = _static_clip(env, "", time, qpos, qpos, [0.1, 0.0, 0.0, 0.0]).similarity["hand_position_mm"]
+    np.testing.assert_allclose(apart, 100, atol=1e-2)
 
 
 @pytest.mark.slow
