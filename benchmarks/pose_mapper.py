@@ -1,10 +1,9 @@
 """Pose mappers trained as a user does: quality, training time, and poses per second.
 
     python -m benchmarks.pose_mapper --out FILE [--seeds 0 1 2] [--plot FILE]
-    python -m benchmarks.pose_mapper --out FILE --regularisation --preset paper --env panda4dof --seeds 0 1
 
 The time to the goal is from the start of the process until the mean distance of unseen poses is within 2 % of the
-optimum. `--regularisation` trains each also with weight decay.
+optimum.
 """
 
 import itertools
@@ -27,24 +26,18 @@ ENVIRONMENTS = ("planar4dof", "planar7dof", "panda7dof", "panda4dof", "panda3dof
 PRESETS = ("paper", "large")
 BATCH = 100_000
 GOAL = 0.02  # above the optimum, on unseen poses
-# A proposal of the paper against overfitting, without values. The decay is AdamW's, in units of the learning rate.
-REGULARISATION: dict[str, tuple[str, ...]] = {
-    "none": (),
-    "weight decay 0.1": ("trainer.weight_decay=0.1",),
-    "weight decay 1": ("trainer.weight_decay=1",),
-}
 COLUMNS = (
-    "report[env] report[seed] preset regularisation report[quality][train]:.2% report[quality][held_out]:.2% "
+    "report[env] report[seed] preset report[quality][train]:.2% report[quality][held_out]:.2% "
     "to_goal_s:.1f process_wall_s:.1f poses_per_second:,.0f"
 )
 SPLITS = {"train": ("training poses", "--"), "held_out": ("unseen poses", "-")}
 
 
-def run(preset: str, env: str, variant: str, seed: int) -> Row:
+def run(preset: str, env: str, seed: int) -> Row:
     arguments = ["trainer=pose_mapper", f"trainer.preset={preset}", f"env={env}", f"seed={seed}"]
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
-        result = train(run_dir, [*arguments, *REGULARISATION[variant]])
+        result = train(run_dir, arguments)
         mapper = mimic.PoseMapper.load(run_dir)
         metrics = np.transpose(read_metrics(run_dir, "step", *(f"quality/quality.{split}" for split in SPLITS)))
         to_goal = time_to_goal(run_dir, "quality.held_out", GOAL)
@@ -53,7 +46,7 @@ def run(preset: str, env: str, variant: str, seed: int) -> Row:
     rate = BATCH / time_program(mapper, jax.device_put(qpos)).median
     curves = {split: values.round(6).tolist() for split, values in zip(SPLITS, metrics[1:], strict=True)}
     curves["training_poses"] = metrics[0].astype(int).tolist()
-    case = {"preset": preset, "regularisation": variant, **result, "curves": curves}
+    case = {"preset": preset, **result, "curves": curves}
     return {**case, "poses_per_second": rate, "to_goal_s": to_goal}
 
 
@@ -79,9 +72,8 @@ def plot(rows: Sequence[Row], out: Path) -> None:
 
 def main() -> None:
     lists = {"preset": PRESETS, "env": ENVIRONMENTS, "seeds": [0, 1, 2]}
-    options = make_parser("pose_mapper", __doc__, **lists, regularisation=False, plot=Path).parse_args()
-    variants = REGULARISATION if options.regularisation else ["none"]
-    cases = itertools.product(options.preset, options.env, variants, options.seeds)
+    options = make_parser("pose_mapper", __doc__, **lists, plot=Path).parse_args()
+    cases = itertools.product(options.preset, options.env, options.seeds)
     rows = collect(options, (run(*case) for case in cases), "runs", COLUMNS, batch=BATCH)
     if options.plot:
         plot(rows, options.plot)

@@ -231,8 +231,6 @@ class PoseMapperConfig(TrainerConfig):
       learning_rate: Adam's learning rate after a warm-up.
       final_learning_rate: learning rate at the end as a fraction of learning_rate; the decay is a cosine. With 1 the
         rate is constant, without warm-up.
-      weight_decay: AdamW's: each update subtracts the fraction learning_rate * weight_decay of every weight; biases do
-        not decay. The presets do not use it.
       patience: training ends after this many evaluations without a smaller distance on the validation poses; 0 disables
         it.
       target_quality: training ends early when the quality on the validation poses is at most this; 0 disables it.
@@ -257,7 +255,6 @@ class PoseMapperConfig(TrainerConfig):
     # Adam's steps are about as large as its rate, and the initial weights are below 1.
     learning_rate: FromPreset[float] = number(None, above=0.0, at_most=1.0)
     final_learning_rate: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
-    weight_decay: FromPreset[float] = number(None, at_least=0.0, at_most=1000.0)  # times the rate in an update
     patience: FromPreset[int] = number(None, at_least=0, at_most=1_000_000)
     target_quality: float = number(0.0, at_least=0.0, at_most=100.0)
     evaluations: FromPreset[int] = number(None, at_least=1, at_most=1_000_000)

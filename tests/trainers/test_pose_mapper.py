@@ -15,7 +15,6 @@ from mimic.envs import env_config
 from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers import run_training as session
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
-from mimic.trainers.pose_mapper import training
 from mimic.trainers.pose_mapper.model import make_model
 from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
 from tests.helpers.tiny import SHORT_ARMS
@@ -165,19 +164,6 @@ def test_limited_joints_stay_within_their_limits():
         mapper(np.array([3.0, 0, 0, -1, 0, 1, 0]))
 
 
-@pytest.mark.slow
-def test_weights_decay_and_biases_do_not():
-    settings = {**SMALL, "learning_rate": 1e-2, "final_learning_rate": 1.0, "weight_decay": 0.5}
-    model = make_model(env_config("planar4dof"), PoseMapperConfig(**settings).resolve())
-    shapes = jax.eval_shape(model.init, jax.random.key(0))
-    params = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), shapes)
-    optimiser = training._optimiser(model.config)
-    change, _ = optimiser.update(jax.tree.map(jnp.zeros_like, params), optimiser.init(params), params)
-    for path, value in jax.tree_util.tree_leaves_with_path(change):
-        expected = -1e-2 * 0.5 if "kernel" in jax.tree_util.keystr(path) else 0.0
-        np.testing.assert_allclose(value, expected, rtol=1e-6)  # float32
-
-
 @pytest.mark.parametrize("name", ["any_arm", "panda_family"])
 def test_an_environment_that_draws_its_learner_is_rejected(reason, name):
     assert reason("train", "trainer=pose_mapper", f"env={name}") == (
@@ -191,8 +177,8 @@ def test_an_environment_that_draws_its_learner_is_rejected(reason, name):
     [
         ({"batch_size": 48}, "trainer.batch_size: expected a divisor of samples = 8192, got 48"),
         ({"preset": "any_arm"}, "trainer.preset: expected one of auto, paper, large, got 'any_arm'"),
-        ({"weight_decay": -0.1}, "trainer.weight_decay: expected a number from 0 to 1000, got -0.1"),
-        ({"weight_decay": float("inf")}, "trainer.weight_decay"),
+        ({"learning_rate": 0.0}, "trainer.learning_rate: expected a number above 0 and at most 1, got 0.0"),
+        ({"learning_rate": float("inf")}, "trainer.learning_rate"),
     ],
 )
 def test_bad_settings_are_rejected(settings, message):

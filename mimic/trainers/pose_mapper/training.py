@@ -153,19 +153,14 @@ def _compile(model: MapperModel, interval: int, seed: int, initial: Params | Non
 
 
 def _optimiser(config: PoseMapperConfig) -> optax.GradientTransformation:
-    """AdamW with a constant rate, or with a warm-up and a cosine decay. Biases do not decay."""
+    """Adam with a constant rate, or with a warm-up and a cosine decay."""
     updates_per_epoch = config.samples // config.batch_size
     updates, rate = config.epochs * updates_per_epoch, config.learning_rate
     warm_up, final = max(round(_WARM_UP * updates), 1), rate * config.final_learning_rate
     schedule = optax.warmup_cosine_decay_schedule(0.0, rate, warm_up, max(updates, warm_up + 1), final)
     if config.final_learning_rate == 1:
         schedule = optax.constant_schedule(rate)
-    adam = optax.adamw(schedule, b2=0.99, weight_decay=config.weight_decay, mask=_is_kernel)
-    return optax.chain(optax.clip_by_global_norm(1.0), adam)
-
-
-def _is_kernel(params: Params) -> Any:
-    return jax.tree.map(lambda x: x.ndim > 1, params)
+    return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule, b2=0.99))
 
 
 def _training_epoch(
