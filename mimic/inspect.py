@@ -9,12 +9,9 @@ def prepare(config: InspectConfig) -> cli.Work:
     if config.clip:
         from pathlib import Path
 
-        from mimic.base.config import new_folder
         from mimic.commands.capture import prepare_capture_inspection
 
-        return prepare_capture_inspection(
-            Path(config.clip).expanduser(), config.capture, new_folder("out", config.out) if config.out else None
-        )
+        return prepare_capture_inspection(Path(config.clip).expanduser(), config.capture)
     from mimic.commands import inspect  # slow to import, and not needed for --help
 
     return inspect.prepare_inspection(config)

@@ -23,7 +23,6 @@ from mimic.motions.mocap.clips import Windows, relative_speeds, slow_down_for, s
 from mimic.motions.mocap.conventions import segments
 from mimic.motions.mocap.link_motion import BOTH, LinkMotion, arm_motion, rigid_error, sides
 from mimic.motions.mocap.names import parts_of
-from mimic.motions.mocap.picture import draw_skeleton
 from mimic.motions.mocap.points import SIDES, ArmPoints, PointMotion, bridge_gaps, gaps, jumps, segment_lengths
 from mimic.motions.mocap.reading import read_motion
 
@@ -188,8 +187,8 @@ def training_env(env: EnvConfig, expert: ArmConfig, demonstrations: Demonstratio
     return dataclasses.replace(env, expert=expert, demonstrations=demonstrations, **changes)
 
 
-def prepare_capture_inspection(source: Path, config: CaptureConfig, out: Path | None) -> Callable[[], None]:
-    """Reads a captured motion; the returned function prints what it has and draws its skeleton.
+def prepare_capture_inspection(source: Path, config: CaptureConfig) -> Callable[[], None]:
+    """Reads a captured motion; the returned function prints what it has.
 
     Raises:
       ValueError: what `read_motion` rejects.
@@ -200,10 +199,6 @@ def prepare_capture_inspection(source: Path, config: CaptureConfig, out: Path | 
         console = Console()
         for line in body_lines(body):
             console.print(line, soft_wrap=True, highlight=False, markup=False)
-        if out:
-            out.mkdir()
-            draw_skeleton(body, out / "skeleton.png", source.name)
-            console.print(f"results: {out}", soft_wrap=True, highlight=False)
         both = [f"{BOTH} env=bimanual"] if len(find_arms(body)) == len(SIDES) else []
         for side in [*find_arms(body), *both]:
             out_file = f"{source.stem}_{side.split()[0]}.npz"

@@ -321,8 +321,10 @@ class InspectConfig:
     def __post_init__(self) -> None:
         check_choice("limits", self.limits, LIMITS)
         _ = base_numbers(self.base)
-        if self.base != "same" and (not self.bound or self.clip):
-            raise ValueError("base: expected none with bound=false or clip=, which compare no hands")
+        if self.clip:
+            check_unused(self, ("out", "base"), "with clip=, whose arms `mimic.view source=` shows")
+        if self.base != "same" and not self.bound:
+            raise ValueError("base: expected none with bound=false, which compares no hands")
 
 
 _HANDS, _FAILING = ("exact", "near", "scaled"), ("left_out", "kept")

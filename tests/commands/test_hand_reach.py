@@ -98,10 +98,11 @@ def test_without_such_a_pose_there_is_no_number(arm):
     ("arguments", "message"),
     [
         (["panda", "base=[0,1]"], "base: expected same, auto or [x,y,z,yaw], got [0, 1]"),
-        (["panda", "base=auto", "bound=false"], "base: expected none with bound=false or clip="),
+        (["panda", "base=auto", "bound=false"], "base: expected none with bound=false, which compares no hands"),
+        (["clip.bvh", "out=pictures"], "out: expected none with clip="),
     ],
 )
-def test_bad_bases(reason, arguments, message):
+def test_keys_without_effect_and_bad_bases(reason, arguments, message):
     assert message in reason("inspect", *arguments)
 
 
