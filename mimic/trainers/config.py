@@ -233,7 +233,6 @@ class PoseMapperConfig(TrainerConfig):
         rate is constant, without warm-up.
       patience: training ends after this many evaluations without a smaller distance on the validation poses; 0 disables
         it.
-      target_quality: training ends early when the quality on the validation poses is at most this; 0 disables it.
       evaluations: number of evaluations and checkpoints.
       validation_poses: number of poses that early stopping is decided on.
       held_out_poses: number of poses that the report is computed on.
@@ -256,7 +255,6 @@ class PoseMapperConfig(TrainerConfig):
     learning_rate: FromPreset[float] = number(None, above=0.0, at_most=1.0)
     final_learning_rate: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
     patience: FromPreset[int] = number(None, at_least=0, at_most=1_000_000)
-    target_quality: float = number(0.0, at_least=0.0, at_most=100.0)
     evaluations: FromPreset[int] = number(None, at_least=1, at_most=1_000_000)
     validation_poses: int = number(1024, at_least=1, at_most=10_000_000)
     held_out_poses: FromPreset[int] = number(None, at_least=1, at_most=10_000_000)

@@ -158,10 +158,6 @@ class PoseMapperTrainer(Trainer):
         unseen = quality["validation"]
         return f"distance {distance:.4f}  above the optimum {quality['train']:.2%}, unseen {unseen:.2%}"
 
-    def good_enough(self, metrics: Metrics) -> bool:
-        """Whether the target quality is reached on the validation poses."""
-        return 0 < self.settings.target_quality >= metrics["quality"]["validation"]
-
     def rows(self, metrics: Metrics) -> list[Row]:
         """Rows of the quality, of the distances that define it, and of the angles between links."""
         rows = (
