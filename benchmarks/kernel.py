@@ -5,15 +5,11 @@
 All methods compute the embodiment distance of joint positions and velocities in the default metric; "gradient" also
 its gradient with respect to the learner's motion, "all" to that of both arms. Batches are of the Panda with 7 joints
 and the one with 4; links are those of two planar arms. `mimic` is `motion_distance` of the links, "mimic, with hands"
-that of the default metric, `composition` the parts of the first called separately, `matrices` a straightforward JAX
-program on 4x4 matrices, `torch` the same in PyTorch, where it is installed. Limits
-of the device are the memory traffic of a copy, and the rate of fused multiply-adds.
+that of the default metric, `composition` the parts of the first called separately. Limits of the device are the memory
+traffic of a copy, and the rate of fused multiply-adds.
 """
 
-import dataclasses
 import functools
-import importlib.util
-import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, cast
 
@@ -24,15 +20,13 @@ import numpy as np
 import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect, failure, print_table
-from benchmarks.common.timing import time_call, time_program
-from benchmarks.peers import kernel_peers
+from benchmarks.common.timing import time_program
 from mimic.metric.config import MetricConfig
 
 BATCHES = (1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8)
 LINKS = (3, 4, 7, 16, 32, 64)
-TORCH = ("torch", "torch.compile")
 HAND = "mimic, with hands"
-METHODS = (*TORCH, "mimic", HAND, "composition", "matrices")  # PyTorch first: JAX keeps its memory
+METHODS = ("mimic", HAND, "composition")
 QUANTITIES = {"value": (), "gradient": (2, 3), "all": (0, 1, 2, 3)}  # arguments of the gradient
 METRIC = MetricConfig()
 WEIGHTS = cast(mimic.DistanceWeights, METRIC.make_weights())  # constants, in the default metric
@@ -68,7 +62,7 @@ def jax_function(method: str, arms: Arms, quantity: str) -> Callable[..., Any]:
         return mimic.embodiment_distance(*states, *case[2:], **hands)
 
     with_hands = functools.partial(mimic.motion_distance, **hands)
-    make = {"mimic": mimic.motion_distance, HAND: with_hands, "matrices": kernel_peers.jax_distance}
+    make = {"mimic": mimic.motion_distance, HAND: with_hands}
     distance, by = make.get(method, lambda *_: composition)(*case), QUANTITIES[quantity]
     return jax.vmap(jax.value_and_grad(distance, by) if by else distance)
 
@@ -94,33 +88,10 @@ def reference(method: str, arms: Arms, motions: Sequence[jax.Array], quantity: s
         return jax.tree.map(np.asarray, values)
 
 
-def torch_call(method: str, arms: Arms, quantity: str, motions: list[jax.Array]) -> tuple[Callable, Callable]:
-    """A call of PyTorch on the same numbers, and what waits for its result; leaves only the first pairs to JAX."""
-    import torch  # pyright: ignore[reportMissingImports]
-
-    device = "cuda" if jax.default_backend() == "gpu" else "cpu"
-    inputs = [torch.as_tensor(np.array(x), device=device) for x in motions]
-    motions[:] = [x[:CHECKED] for x in motions]
-    variables = [inputs[index].requires_grad_() for index in QUANTITIES[quantity]]
-    distance = kernel_peers.torch_distance(arms.expert, arms.learner, arms.correspondence, WEIGHTS, device=device)
-    distance = torch.compile(distance) if method == "torch.compile" else distance
-
-    def call() -> Any:
-        value = distance(*inputs)
-        return (value, torch.autograd.grad(value.sum(), variables)) if variables else value
-
-    return call, lambda _: torch.cuda.synchronize() if device == "cuda" else None
-
-
 def run(method: str, arms: Arms, batch: int, quantity: str) -> Row:
     motions = random_motions(arms, batch)
-    if method in TORCH:
-        timing = time_call(*torch_call(method, arms, quantity, motions))
-        timing = dataclasses.replace(timing, compile=timing.first)
-        values = jax.tree.map(lambda x: x[:CHECKED].detach().cpu().numpy(), timing.result)
-    else:
-        timing = time_program(jax_function(method, arms, quantity), *motions)
-        values = jax.tree.map(lambda x: np.asarray(x[:CHECKED]), timing.result)
+    timing = time_program(jax_function(method, arms, quantity), *motions)
+    values = jax.tree.map(lambda x: np.asarray(x[:CHECKED]), timing.result)
     pairs = zip(*map(jax.tree.leaves, (values, reference(method, arms, motions, quantity))), strict=True)
     value, *gradients = (float(np.abs(a - b).max()) for a, b in pairs)
     error = {"value": value, **({"gradient": max(gradients)} if gradients else {})}
@@ -139,8 +110,6 @@ def sweep(name: str, cases: dict[int, tuple[Arms, int]], method: str) -> Iterato
             yield row
             if "failed" in row or row["median_ms"] > 1e3 * LONGEST:
                 break
-    if method in TORCH:
-        kernel_peers.free_torch_memory()
 
 
 def limits() -> dict[str, float]:
@@ -152,20 +121,18 @@ def limits() -> dict[str, float]:
 
 
 def main() -> None:
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # PyTorch needs memory too
     on_gpu = jax.default_backend() == "gpu"
     lists = {"batches": list(BATCHES if on_gpu else BATCHES[:5]), "links": [*LINKS], "methods": METHODS}
     options = make_parser("kernel", __doc__, link_batch=1e6 if on_gpu else 1e3, **lists).parse_args()
-    missing = {} if importlib.util.find_spec("torch") else dict.fromkeys(TORCH, "PyTorch is not installed")
     panda = Arms(mimic.panda(), mimic.panda(locked=(3, 6, 7)))
     sweeps = {
         "batch": {int(batch): (panda, int(batch)) for batch in sorted(options.batches)},
         "links": {links: (planar_pair(links), int(options.link_batch)) for links in sorted(options.links)},
     }
-    methods = [method for method in METHODS if method in options.methods and method not in missing]
+    methods = [method for method in METHODS if method in options.methods]
     rows = (row for method in methods for name, cases in sweeps.items() for row in sweep(name, cases, method))
     device = limits()
-    collect(options, rows, "results", COLUMNS, limits=device, absent=missing)
+    collect(options, rows, "results", COLUMNS, limits=device)
     print_table([device], "copy_bytes_per_second:.3g flops:.3g")
 
 

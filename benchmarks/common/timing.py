@@ -39,8 +39,8 @@ def time_program(function: Callable[..., Any], *arguments: Any) -> Timing:
     return dataclasses.replace(time_call(lambda: program(*arguments)), compile=compile_s, bytes=size)
 
 
-def time_call(call: Callable[[], Any], wait: Callable[[Any], Any] = jax.block_until_ready, repeats: int = 9) -> Timing:
-    """Times calls of a function of no arguments, each until `wait` returns for its result."""
+def time_call(call: Callable[[], Any], repeats: int = 9) -> Timing:
+    """Times calls of a function of no arguments, each until its result is there."""
     result: Any = None
 
     def seconds(calls: int) -> float:
@@ -48,7 +48,7 @@ def time_call(call: Callable[[], Any], wait: Callable[[Any], Any] = jax.block_un
         began = time.perf_counter()
         for _ in range(calls):
             result = call()
-        wait(result)
+        jax.block_until_ready(result)
         return (time.perf_counter() - began) / calls
 
     first, second = seconds(1), seconds(1)
