@@ -12,7 +12,7 @@ from mimic.arms.capsules import fit_capsules
 from mimic.control.clearance import clearance
 from mimic.metric.capsule_distances import capsule_axes, changing_pairs, clearance_constants, pair_distances
 
-CONFIGS = {"panda": ArmConfig(), "locked": ArmConfig(locked=[3, 6, 7]), "two arms": ArmConfig(model="panda_pair")}
+CONFIGS = {"locked": ArmConfig(locked=[3, 6, 7]), "two arms": ArmConfig(model="panda_pair")}
 
 
 def poses(arm, count=500, seed=0):
@@ -20,7 +20,7 @@ def poses(arm, count=500, seed=0):
     return np.random.default_rng(seed).uniform(lower, upper, (count, arm.num_joints)).astype(np.float32)
 
 
-@pytest.mark.slow_for("panda", "two arms")
+@pytest.mark.slow_for("two arms")
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 def test_it_is_the_distance_of_the_costs(config):
     arm, capsules = build_arm(config, "hardware").embodiment, fit_capsules(config, "hardware")
