@@ -35,7 +35,6 @@ LATE = [
     (["seed=" + "[" * 3000], "error"),
     (["-m", "seed=range(1000000000)"], "expected at most 1,000 runs in a sweep"),
     (["-m", "seed=glob(*)"], "expected at least 1 run"),
-    (["-m", "hydra/launcher=submitit_local", "hydra.launcher.parallel=1000000000"], "from 1 to 1,000, got 1000000000"),
     (["-m", "seed=1,2", "hydra.sweep.dir=/dev/null/x"], "hydra.sweep.dir: '/dev/null/x': cannot write in '/dev/null'"),
     (["run_dir=${oc.env:SECRET_TOKEN}"], "run_dir: expected no ${...} other than a reference to a key"),
     (["-m", "run_dir='${oc.env:SECRET_TOKEN}',b"], "run_dir: expected no ${...} other than a reference to a key"),
@@ -60,24 +59,12 @@ def test_odd_command_lines(rejected, monkeypatch, arguments, message):
     assert message in error and "not-for-others" not in error and len(error) < 1100
 
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("trainer.entropy_cost=nan", "trainer.entropy_cost: expected a number from 0 to 1000, got nan"),
-        ("env.learner.damping=1e30", "env.learner.damping: expected a number from 0 to 10000, or a mapping"),
-        ("env.substeps=1000000000", "env.substeps: expected a whole number from 1 to 1,000, got 1000000000"),
-    ],
-)
-def test_absurd_settings(reason, setting, message):
-    assert message in reason("train", "env=panda4dof", setting)
-
-
 def test_absurd_recordings(reason):
     steps = ["env.demonstrations.count=100000", "env.horizon=10000"]
     assert "physics steps to record, got 10,008,000,000" in reason("train", "env=panda4dof", *steps)
 
 
-@pytest.mark.parametrize("run_dir", ["/proc/x", "/dev/null/x", "x" * 300, "a/" * 3000])
+@pytest.mark.parametrize("run_dir", ["/dev/null/x", "a/" * 3000])
 def test_run_directories_that_cannot_be_written(reason, run_dir):
     error = reason("train", "env=planar4dof", f"run_dir={run_dir}")
     assert "run_dir: " in error and ("cannot write in" in error or "expected a shorter path" in error)

@@ -108,13 +108,12 @@ def test_the_printed_command_trains_the_same_learner_on_the_clip(written, monkey
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arms", ["written", "both"])
-def test_the_printed_command_trains(request, arms):
-    folder, printed = request.getfixturevalue(arms)
+def test_the_printed_command_trains(both):
+    folder, printed = both
     (words,) = printed_words(printed, "train on it", "train")
     small = ["trainer.num_timesteps=4096", "trainer.num_envs=16", "trainer.batch_size=16", "trainer.evaluations=1"]
-    run("train", *words, *small, "env.physics=fused", f"run_dir={arms}", folder=folder)
-    assert (folder / arms / "report.json").is_file()
+    run("train", *words, *small, "env.physics=fused", "run_dir=run", folder=folder)
+    assert (folder / "run" / "report.json").is_file()
 
 
 def test_inspect_shows_what_a_clip_has(clip, tmp_path):

@@ -1,7 +1,6 @@
 """Bad input of commands: one line that names what is valid, exit code 2, nothing written."""
 
 import runpy
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -19,7 +18,6 @@ from tests.helpers.repository import REPOSITORY
     ("arguments", "message"),
     [
         (["env.world.payload=[0,1]"], "env.world.payload: expected with an inner loop, as in world=ideal"),
-        (["env.previw=1"], "unknown key 'env.previw'; valid are"),
         (["seed=one"], "could not be converted to Integer"),
         (["+foo=1"], "foo"),
         (["trainer=pose_mapper", "trainer.num_envs=8"], "unknown key 'trainer.num_envs'; valid are name, preset"),
@@ -29,33 +27,15 @@ from tests.helpers.repository import REPOSITORY
 )
 def test_bad_training_input(rejected, arguments, message):
     error = rejected("train", *arguments)
-    has_close_name = any(word in message for word in ("previw", "num_envs", "did you mean"))
+    has_close_name = any(word in message for word in ("num_envs", "did you mean"))
     assert message in error and ("did you mean" in error) == has_close_name
 
 
-@pytest.mark.slow
-def test_bad_input_ends_the_process_with_one_line():
-    result = subprocess.run(
-        [sys.executable, "-m", "mimic.train", "env=panda5dof"], capture_output=True, text=True, timeout=280, check=False
-    )
-    valid = "any_arm, bimanual, pair, panda3dof, panda4dof, panda7dof"
-    assert result.returncode == 2 and result.stderr.count("\n") == 1
-    assert f"unknown env 'panda5dof'; valid are {valid}" in result.stderr
-
-
-@pytest.mark.parametrize("command", ["train", "inspect"])
-def test_the_version_is_that_of_mimic(command, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", [f"mimic.{command}", "--version"])
-    cli.run(lambda config: pytest.fail("the command ran"), command)
-    assert capsys.readouterr().out == f"mimic {mimic.__version__}\n"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [([], "  train  "), (["--help"], "  train  "), (["--version"], f"mimic {mimic.__version__}\n")],
-)
-def test_the_overview_and_the_version(arguments, expected, capsys):
-    assert main(arguments) == 0 and expected in capsys.readouterr().out
+def test_the_version_is_that_of_mimic(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["mimic.inspect", "--version"])
+    cli.run(lambda config: pytest.fail("the command ran"), "inspect")
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == 2 * f"mimic {mimic.__version__}\n"
 
 
 @pytest.mark.filterwarnings("ignore:.*sys.modules:RuntimeWarning")  # runpy: the module is imported already
@@ -77,7 +57,6 @@ def test_the_console_script_runs_a_command(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["trian"], "unknown command 'trian'; valid are collect, "),
         (["trian"], "; did you mean train?"),
         (["env=panda4dof"], "expected a command before 'env=panda4dof', as in mimic train env=panda4dof"),
     ],
@@ -114,8 +93,9 @@ def test_hydra_completes_keys_and_choices(monkeypatch, capsys):
     assert capsys.readouterr().out == "env=planar4dof\n"
 
 
-def test_all_commands_are_listed(capsys):
+@pytest.mark.parametrize("arguments", [[], ["--help"]])
+def test_all_commands_are_listed(arguments, capsys):
     commands = {file.stem for file in (Path(mimic.__file__).parent / "conf").glob("*.yaml")}
-    assert main([]) == 0
+    assert main(arguments) == 0
     listed = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()[2:]]
     assert {words[0] for words in listed if len(words) == 2 and words[0] != "mimic"} == set(commands)

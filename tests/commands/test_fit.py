@@ -10,6 +10,7 @@ import pytest
 
 import mimic
 from mimic.envs.imitation import training_and_held_out
+from tests.helpers.run_directories import write_run
 
 SMALL = {"physics": "fused", "horizon": 5, "demonstrations": {"count": 2, "held_out": 1}}
 TRAINER = {
@@ -56,11 +57,10 @@ def test_a_run_is_evaluated_and_opened_again(fitted, capsys):
         run.evaluate(masses=1.2)
 
 
-@pytest.mark.slow
-def test_a_run_without_a_report_is_one_line(fitted, tmp_path):
-    (tmp_path / "config.yaml").write_text((fitted[0].run_dir / "config.yaml").read_text())
+def test_a_run_without_a_report_is_one_line(tmp_path):
+    run_dir = write_run(tmp_path / "run", [0.5], report=False)
     with pytest.raises(ValueError, match="report.json' cannot be read"):
-        _ = mimic.Run(tmp_path).report
+        _ = mimic.Run(run_dir).report
 
 
 class Renamed(mimic.ImitationEnv):
@@ -87,9 +87,8 @@ def test_a_bad_training_is_one_line_and_writes_nothing(arguments, message, tmp_p
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
-def test_other_demonstrations_than_those_of_the_config_are_rejected(fitted, tmp_path):
-    env = fitted[1]
+def test_other_demonstrations_than_those_of_the_config_are_rejected(tmp_path):
+    env = mimic.make("planar4dof", **SMALL)
     other = env.with_demonstrations(training_and_held_out(env.config)[1])
     with pytest.raises(ValueError, match="expected the demonstrations of its config, got others"):
         mimic.fit(other, trainer=TRAINER, run_dir=str(tmp_path / "run"))

@@ -26,6 +26,7 @@ from mimic.motions.mocap.link_motion import LinkMotion
 STEPS = 2  # of a motion: 0.2 s, 7 frames
 EVERY = 3  # frames from one sample to the next, 0.1 s at 30 frames a second
 ROUNDING = 1e-5  # of distances of about 1 in float32
+BASE = [0.1, 0.2, 0.0, 0.5]
 
 
 def swings(arm):
@@ -36,7 +37,7 @@ def swings(arm):
 
 
 def saved(folder, arms) -> dict[str, Any]:
-    save_motions(folder, arms, swings(arms[0]), swings(arms[1]), None)
+    save_motions(folder, arms, swings(arms[0]), swings(arms[1]), BASE)
     return {"retargeted": str(folder), "compilation_cache": ""}
 
 
@@ -78,6 +79,7 @@ def test_a_turned_base_counts_in_all_measures():
 @pytest.mark.slow
 def test_retargeted_motions_are_shown_as_they_are(plan):
     clip, env = plan.compute(), env_config("planar4dof")
+    assert clip.base == BASE
     arms = env.build_arms().embodiments
     for shown, arm in zip(clip.poses, arms, strict=True):
         assert len(shown) == len(clip.time) == EVERY * STEPS + 1
@@ -120,9 +122,9 @@ def test_a_video_has_all_frames(plan, files, tmp_path, capsys, monkeypatch):
         prepare_video(RenderConfig(**files, out=str(out)))
 
 
-@pytest.mark.parametrize("options", [["-vf", "select=lt(n\\,2)"], ["-frames:v", "2"], ["-f", "null"]])
+@pytest.mark.parametrize("options", [["-frames:v", "2"], ["-f", "null"]])
 def test_a_video_that_lacks_frames_is_removed(tmp_path, monkeypatch, options):
-    """The encoder leaves the last frames out, ends before them, or writes no file."""
+    """The encoder ends before the last frames, or writes no file."""
     encode = functools.partial(imageio_ffmpeg.write_frames, output_params=options)
     monkeypatch.setattr(imageio_ffmpeg, "write_frames", encode)
     frames = np.zeros((5, 640, 1280, 3), np.uint8)
@@ -139,6 +141,7 @@ def test_a_video_that_lacks_frames_is_removed(tmp_path, monkeypatch, options):
         ({"expert": "planar7dof"}, "expert: expected the arm of the data set, .* got planar4 with"),
         ({"demonstration": 2}, "demonstration: expected a number from 0 to 1, got 2"),
         ({"run": "runs/NAME"}, "run: expected none with retargeted=FOLDER"),
+        ({"locked": [3]}, "locked: expected none with retargeted=FOLDER"),
     ],
 )
 def test_bad_files_are_rejected_in_one_line(files, changes, message):

@@ -1,11 +1,9 @@
-"""The motions beside a data set of `mimic.retarget`, and the videos of them."""
+"""The motions beside a data set of `mimic.retarget`."""
 
 import numpy as np
 import pytest
 
 from mimic.arms.embodiment import panda, planar_arm
-from mimic.commands.clips import prepare_clip
-from mimic.commands.config import RenderConfig
 from mimic.commands.retargeted_motions import MOTIONS, read_motions, save_motions
 from mimic.motions.formats.episodes import Motion
 
@@ -85,37 +83,3 @@ def test_a_damaged_array_is_one_line(folder, changes):
     np.savez(folder / MOTIONS, **arrays | changes)
     with pytest.raises(ValueError, match=r"retargeted: '.*' is damaged: [^\n]*$"):
         read_motions(folder)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"expert": ""}, "expert: expected with retargeted=FOLDER"),
-        ({"locked": [3]}, "locked: expected none with retargeted=FOLDER"),
-        ({"learner": "panda"}, "learner: expected the arm of the data set, with joints .*, got panda"),
-    ],
-)
-def test_keys_of_a_video_of_a_data_set(tmp_path, changes, message):
-    save_motions(tmp_path, (panda(), planar_arm((0.3,) * 4)), motions(7), motions(4), None)
-    with pytest.raises(ValueError, match=message):
-        prepare_clip(RenderConfig(**{"retargeted": str(tmp_path), "expert": "panda", "learner": "panda"} | changes))
-
-
-def test_a_number_beyond_the_episodes_is_one_line(tmp_path):
-    save_motions(tmp_path, (panda(), panda()), motions(7), motions(7), None)
-    config = RenderConfig(retargeted=str(tmp_path), expert="panda", learner="panda", demonstration=2)
-    with pytest.raises(ValueError, match="demonstration: expected a number from 0 to 1, got 2"):
-        prepare_clip(config)
-
-
-@pytest.mark.slow
-def test_a_video_of_a_data_set_shows_an_episode(tmp_path):
-    save_motions(tmp_path, (panda(), panda()), motions(7), motions(7), BASE)
-    plan = prepare_clip(RenderConfig(retargeted=str(tmp_path), expert="panda", learner="panda", demonstration=1))
-    clip = plan.compute()
-    assert clip.base == BASE
-    assert len(clip.time) == 19  # 0.6 s at 30 frames a second, and the first
-    for poses in clip.poses:
-        np.testing.assert_allclose(poses[::3], motions(7)["second"].qpos, atol=1e-9)  # every 0.1 s
-    ghost = clip.match.ghost(clip.poses[0][0], clip.poses[1][0], base=[0.0] * 4)
-    np.testing.assert_allclose(ghost[-1].start, ghost[-1].end, atol=1e-6)  # both arms are the same, at one place

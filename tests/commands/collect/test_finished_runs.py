@@ -24,7 +24,6 @@ def quick(monkeypatch, schemas):
     [
         (REPORT, "[1]", r"report.json cannot be read: expected an object, got [1]"),
         (REPORT, "[" * 100_000, "report.json cannot be read: expected values that are not nested as deeply"),
-        (REPORT, '{"versions": 3}', "has no number optimality_gap.train"),
         (REPORT, '{"optimality_gap": {"train": 1e400, "held_out": 1}}', "has no number optimality_gap.train"),
         (METRICS, f"{HEADER}1000,0.1,0.2,1000,0.1,0.2\n", "metrics.csv cannot be read: line 2 has 6 cells, expected 3"),
         (METRICS, f"{HEADER}1000,0.1,x\n", "metrics.csv cannot be read: could not convert string to float"),
