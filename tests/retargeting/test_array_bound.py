@@ -21,7 +21,7 @@ WEIGHTS = check_metric(MetricConfig(hand_rotation=0.0))
 # Locked joints and limits: without limits the joints are continuous.
 pytestmark = pytest.mark.slow  # compiling the search for both kinds of arms takes over a minute
 
-LEARNERS = [((), "none"), ((2,), "hardware"), ((3, 6, 7), "none"), ((2, 3, 6, 7), "hardware")]
+LEARNERS = [((), "none"), ((2,), "hardware"), ((3, 6, 7), "none")]
 FEW = np.array([0.2, 0.5, 0.9])  # times of a demonstration of length 1: time is not what is tested
 
 
@@ -114,11 +114,11 @@ def test_angles_stay_within_the_joint_range(batch):
 
 def test_other_arms_compile_nothing(batch):
     """Neither other locked joints nor other lengths do; the results are those of these arms."""
-    arms = stack_arms([arrays(locked) for locked in ((1,), (4, 5), (6, 7))] + [arrays((2,), "hardware")])
+    arms = stack_arms([arrays(locked) for locked in ((1,), (4, 5))] + [arrays((2,), "hardware")])
     longer = dataclasses.replace(arms, offset=np.float32(1.2) * arms.offset)
     other = solved(longer)[0]
     assert len(TRACES) == 1
-    assert np.all(other.distance[3] > 1.01 * batch[1].distance[1])  # the same arm but for its lengths
+    assert np.all(other.distance[2] > 1.01 * batch[1].distance[1])  # the same arm but for its lengths
 
 
 def test_bad_input_is_rejected(unchecked):

@@ -38,13 +38,6 @@ def test_it_is_the_distance_of_the_costs(config):
     np.testing.assert_allclose(actual, jax.jit(jax.vmap(expected))(qpos), atol=2e-4)
 
 
-def test_an_arm_without_pairs_has_the_clearance_of_the_floor():
-    config = ArmConfig(locked=[1, 3, 4, 5, 6, 7])  # one body that moves, and the base
-    arm, capsules = build_arm(config, "hardware").embodiment, fit_capsules(config, "hardware")
-    no_pairs = dataclasses.replace(capsules, joint=(0,) * len(capsules.joint))
-    assert no_pairs.pairs == () and clearance(np.zeros(1), clearance_constants(arm, no_pairs)) > 0
-
-
 def test_the_floor_may_be_lower():
     config = ArmConfig(locked=[1, 3, 4, 6, 7])
     arm, capsules = build_arm(config, "hardware").embodiment, fit_capsules(config, "hardware")

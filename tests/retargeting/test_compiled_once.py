@@ -11,7 +11,7 @@ from mimic.arms.embodiment import planar_arm
 from mimic.metric.config import MetricConfig
 from mimic.metric.correspondence import hard_correspondence
 from mimic.metric.distance import DistanceWeights
-from mimic.retargeting.kinematic_bound import closest_motion, kinematic_bound
+from mimic.retargeting.kinematic_bound import kinematic_bound
 from mimic.retargeting.pose import imitate_pose
 from mimic.retargeting.trajectory import imitate_trajectory
 from tests.helpers.compilations import count_compilations
@@ -38,15 +38,12 @@ FUNCTIONS = {
     "imitate_pose": (pose, DEFAULT),
     "key": (lambda q, metric: pose(q, metric, key=jax.random.key(int(1e4 * abs(q[0, 0])))), DEFAULT),
     "adaptive": (pose, MetricConfig(adaptive=True)),  # functions of the metric that are equal by value
-    "soft": (pose, MetricConfig(correspondence="soft")),
-    "warm": (lambda q, metric: pose(q, metric, warm_start=q[:, :2]), DEFAULT),
     "imitate_trajectory": (lambda q, metric: imitate_trajectory(*arms(), q, **metric, starts=1), DEFAULT),
     "kinematic_bound": (lambda q, metric: kinematic_bound(*arms(), q, 0 * q, **metric, **MOTION), DEFAULT),
-    "closest_motion": (lambda q, metric: closest_motion(*arms(), q, 0 * q, **metric, **MOTION), DEFAULT),
 }
 
 
-@pytest.mark.slow_for("key", "imitate_trajectory", "kinematic_bound", "closest_motion", "warm", "soft")
+@pytest.mark.slow_for("key", "imitate_trajectory", "kinematic_bound")
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_second_call_compiles_nothing(name):
     call, metric = FUNCTIONS[name]

@@ -97,25 +97,24 @@ def test_arrays_of_weights_and_a_correspondence_known_only_at_run_time():
 
 
 @pytest.mark.parametrize("rotation", ["cosine", "angle"])
-def test_a_match_has_zero_gradient_and_finite_curvature(dtype, rotation):
+def test_a_match_has_zero_gradient_and_finite_curvature(rotation):
     """At the kink of lengths and angles. 1e-4: rounding moves a position by 1e-7 chain lengths; s is 1e-3."""
     arm = panda()
     closed = pose_objective(arm, Metric(arc_length_correspondence(arm, arm), DEFAULT, rotation))
     for qpos in (np.zeros(7), np.linspace(-2, 2, 7)):
-        angles = jnp.asarray(qpos, dtype)
+        angles = jnp.asarray(qpos, jnp.float32)
         here = closed.derivatives(closed.target(link_states(arm, angles)), tuple(angles))
-        assert abs(here.value) <= 1e-8 and here.value.dtype == dtype
+        assert abs(here.value) <= 1e-8 and here.value.dtype == jnp.float32
         np.testing.assert_allclose(jnp.stack(here.gradient), 0, atol=1e-4)
         assert all(np.all(np.isfinite(jnp.stack(row))) for row in here.hessian)
 
 
-@pytest.mark.slow_for("float32")
-def test_smoothing_changes_the_distance_by_less_than_its_own_size(dtype):
+def test_smoothing_changes_the_distance_by_less_than_its_own_size():
     """Arc length W has entries that sum to n n_hat: the mean length is off by s at most; 1e-5 for float32."""
     expert, learner = panda(), panda(locked=(3, 6, 7))
     matrix = arc_length_correspondence(expert, learner)
     closed = pose_objective(learner, Metric(matrix, DEFAULT))
-    qpos = np.random.default_rng(2).uniform(-3, 3, (64, 7)).astype(dtype)
+    qpos = np.random.default_rng(2).uniform(-3, 3, (64, 7)).astype(np.float32)
 
     @jax.jit
     @jax.vmap
@@ -136,8 +135,6 @@ OVERLAP = overlap_correspondence(panda(), panda())
 @pytest.mark.parametrize(
     ("correspondence", "weights", "rotation", "reduction", "is_closed"),
     [
-        (OVERLAP, DIRECTIONS, "cosine", "mean", True),
-        (OVERLAP, BOTH, "cosine", "mean", True),
         (OVERLAP, DEFAULT, "cosine", "mean", True),
         (OVERLAP, DIRECTIONS, "angle", "mean", True),
         (OVERLAP, DIRECTIONS, "cosine", "frobenius", False),
