@@ -177,7 +177,9 @@ def _time(function: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode], E
 
 EVERY = "qpos", "qvel", "action"  # all that has joints: only the hand knows better
 NUMBERS = {
-    "degrees for rad": Corruption(of_joints(np.degrees, *EVERY), "units: deg|expected rad in|units=deg", {"units": ""}),
+    "degrees for rad": Corruption(
+        of_joints(np.degrees, *EVERY), "expected rad in|units=deg", {"units": ""}, formats=("csv",)
+    ),
     "rad for degrees": Corruption(of_joints(lambda x: x), "no joint moves by more than", {"units": "deg"}),
     "two joints exchanged": Corruption(of_joints(_order(0, 1, 2, 5, 4, 3, 6)), "joint4, joint6 look exchanged"),
     "three joints exchanged": Corruption(of_joints(_order(1, 2, 0, 3, 4, 5, 6)), "joint1, joint2, joint3 look exch"),
@@ -205,7 +207,7 @@ NUMBERS = {
                                  formats=("v3.0", "v2.1", "hdf5", "csv")),
     "backward stamps": Corruption(_time(lambda time: time[::-1]), "time steps back|do not increase|that increase",
                                   formats=("v3.0", "v2.1", "csv")),
-    "a sample without numbers": Corruption(of_joints(_at(9, np.nan)), "without numbers|not finite"),
+    "a sample without numbers": Corruption(of_joints(_at(9, np.nan)), "without numbers|not finite", formats=("npz",)),
     "no numbers": Corruption(of_joints(lambda x: np.nan * x), "no number as angle|not finite|no number"),
     "a jump": Corruption(of_joints(_from(70, 0.5)), "split where a joint jumps"),
     "a joint too few": Corruption(of_joints(lambda x: x[:, :6], *EVERY), "has no|expected|lacks|joint7|joints"),

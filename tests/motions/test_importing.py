@@ -67,9 +67,8 @@ def test_a_table_becomes_demonstrations_that_training_takes(tmp_path):
     loaded.check_fits(mimic.panda(), 0.1, 50)
 
 
-@pytest.mark.parametrize("spelling", ["joint{}", "q_{}", "q_joint{}"])
-def test_velocities_are_differentiated_where_there_are_none(tmp_path, spelling):
-    source = table(tmp_path / "swing.csv", names=[spelling.format(i) for i in range(1, 8)])
+def test_velocities_are_differentiated_where_there_are_none(tmp_path):
+    source = table(tmp_path / "swing.csv", names=[f"q_joint{i}" for i in range(1, 8)])
     loaded, notes = mimic.import_demonstrations(source, mimic.panda())
     assert "velocities: computed from the angles" in notes[0]
     _, qvel = swing(0.1 * np.arange(51))
@@ -109,9 +108,7 @@ def test_locomujoco_files_are_split_and_their_free_joint_is_left_out(tmp_path):
         np.testing.assert_allclose(imported.qvel[which], qvel, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("shape", "kind"), [((600, 2, 3), "float64"), ((600,), "float64"), ((600, 6), "float64"), ((600, 3), "<U3")]
-)
+@pytest.mark.parametrize(("shape", "kind"), [((600, 6), "float64"), ((600, 3), "<U3")])
 def test_an_array_of_no_single_hand_is_noted(tmp_path, shape, kind):
     """Such as of two hands, or text: the joints are read nevertheless."""
     source = archive(tmp_path / "loco.npz", hand_pos=np.zeros(shape, kind))
@@ -134,10 +131,7 @@ def test_joint_names_of_the_file_can_be_given(tmp_path):
         (lambda path: table(path, names=NUMBERED[:6] + ["q_9"]), [], "has no table with the joints joint1"),
         (lambda path: table(path, names=NUMBERED, factor=57.3), [], "12.5664]; degrees need units=deg"),
         (lambda path: table(path, names=NUMBERED, time=TIME[:100]), [], "lasts 1.98 s, but an episode 5 s"),
-        (lambda path: table(path, names=NUMBERED, time=TIME[::-1]), [], "at times that increase"),
         (lambda path: table(path, names=NUMBERED, factor=16.0, time=TIME), ["limits=none"], "has a velocity of"),
-        (lambda path: path.write_text("time,q_1\n0,a\n1,2\n"), [], "is no table of numbers below a header"),
-        (lambda path: table(path, names=NUMBERED), ["kind=reach"], "kind: expected none with source=FILE"),
         (lambda path: table(path, names=NUMBERED), ["joints=[a]"], "joints: expected 7 names"),
     ],
 )  # fmt: skip

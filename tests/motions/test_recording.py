@@ -52,14 +52,6 @@ def test_every_kind_stays_within_the_limits_of_the_manufacturer(limits):
     assert np.all(acceleration <= np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0]) + 1e-9)
 
 
-def test_an_acceleration_limit_makes_a_recording_redraw_goals():
-    limit, redrawn = np.full(7, 4.5), []
-    recorded = mimic.record_demonstrations(
-        panda(), 5, kind="computed_torque", max_acceleration=limit, on_recorded=redrawn.append
-    )
-    assert sum(redrawn) > 0 and np.abs(np.diff(recorded.qvel, axis=1)).max() <= 0.45
-
-
 def test_the_test_set_is_another_one_than_any_seed_gives():
     config = mimic.env_config("planar4dof")
     expert = config.build_arms().expert

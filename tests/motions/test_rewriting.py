@@ -272,8 +272,8 @@ def test_a_recorded_hand_that_wipes_a_table_has_no_warning():
     assert not [note for note in data.notes if note.startswith("warning")]
 
 
-@pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_a_table(tmp_path, separator):
+def test_a_table(tmp_path):
+    separator = ";"
     header = ["note", "time", *(f"{name} [deg]" for name in OLD), "jaw", "demonstration"]
     lines = ["# of a robot", separator.join(header)]
     for episode, count in enumerate(COUNTS):
