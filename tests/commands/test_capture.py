@@ -95,19 +95,6 @@ def test_a_gap_in_the_other_arm_splits_nothing(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_printed_command_trains_the_same_learner_on_the_clip(written, monkeypatch):
-    folder, printed = written
-    monkeypatch.chdir(folder)
-    (words,) = printed_words(printed, "train on it", "train")
-    env, demonstrations = compose("train", *words).env, mimic.load_demonstrations(folder / "left.npz")
-    assert env.learner == mimic.env_config("panda7dof", learner={"locked": [7]}).learner
-    expert, learner = env.build_arms().embodiments
-    demonstrations.check_fits(expert, env.control_dt, env.horizon)
-    assert learner.num_joints == 6 and env.demonstrations.path == "left.npz"
-    assert env.demonstrations.count + env.demonstrations.held_out == demonstrations.count
-
-
-@pytest.mark.slow
 def test_the_printed_command_trains(both):
     folder, printed = both
     (words,) = printed_words(printed, "train on it", "train")

@@ -156,21 +156,6 @@ def test_a_gripper_comes_back_from_a_dataset(recorded, tmp_path, format):
     np.testing.assert_allclose(after.qvel, before.qvel, rtol=0, atol=2e-7)
 
 
-def test_a_policys_motions_become_demonstrations(run_dir, written):
-    dataset, topic = written, "observation.state"
-    learner = mimic.build_arm(environment().learner).embodiment
-    free = np.full(2, np.inf)  # an untrained policy keeps no limits
-    learner = dataclasses.replace(learner, joint_range=np.stack([-free, free], axis=1), velocity_limit=free)
-    imported, notes = mimic.import_demonstrations(dataset, learner, dt=0.05, horizon=2 * HORIZON, topic=topic)
-    assert imported.count == COUNT + HELD_OUT and "velocities: from the source" in notes[0]  # twice the rate: resampled
-    same = mimic.import_demonstrations(dataset, learner, dt=0.1, horizon=HORIZON, topic=topic)[0]
-    np.testing.assert_allclose(imported.qpos[:, ::2], same.qpos, rtol=0, atol=1e-6)  # rad
-    expert = mimic.build_arm(environment().expert).embodiment
-    of_expert, _ = mimic.import_demonstrations(dataset, expert, dt=0.1, horizon=HORIZON)  # only it has three joints
-    demonstrations = mimic.load_demonstrations(run_dir / "demonstrations.npz")
-    np.testing.assert_allclose(of_expert.qpos, demonstrations.qpos, rtol=0, atol=1e-6)  # rad
-
-
 def test_a_runaway_ends_an_episode():
     qvel = np.ones((4, 5, 2))
     qvel[1, 3, 0], qvel[2, 0, 1], qvel[3, 4] = 30.0, -40.0, np.nan

@@ -83,11 +83,9 @@ def evaluate(run_dir, out, **settings):
     return json.loads((out / "report.json").read_text())
 
 
-@pytest.mark.slow_for("mimic")
-@pytest.mark.parametrize("loop", ["mimic", "ruckig"])
-def test_a_policy_of_the_hardware_world(evaluation, tmp_path, capsys, loop):
-    report = evaluation(tmp_path / "new", robot_loop=loop)
-    assert report["robot_loop"] == loop
+def test_a_policy_of_the_hardware_world(evaluation, tmp_path, capsys):
+    report = evaluation(tmp_path / "new", robot_loop="ruckig")
+    assert report["robot_loop"] == "ruckig"
     row = report["cases"]["all ranges"]
     assert report["robot"] == "virtual_panda" and report["world"]["payload"] == [0.0, 3.0]
     assert row["episodes"] == row["completed"] == 4 and row["aborts"] == row["stops"] == {}

@@ -16,21 +16,13 @@ from mimic.metric.distance import Metric
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.array_bound import closest_motion
 from tests.helpers.array_cases import padded
+from tests.retargeting.test_kinematic_bound import demonstration
 
 WEIGHTS = check_metric(MetricConfig(hand_rotation=0.0))
 # Locked joints and limits: without limits the joints are continuous.
 pytestmark = pytest.mark.slow  # compiling the search for both kinds of arms takes over a minute
 
 LEARNERS = [((), "none"), ((2,), "hardware"), ((3, 6, 7), "none")]
-FEW = np.array([0.2, 0.5, 0.9])  # times of a demonstration of length 1: time is not what is tested
-
-
-def demonstration(seed):
-    """Angles and velocities [T, 7] of a minimum-jerk motion of 5 s from the zero pose to a random goal."""
-    goal = np.random.default_rng(seed).uniform(-np.pi / 2, np.pi / 2, 7)
-    qpos = (10 * FEW**3 - 15 * FEW**4 + 6 * FEW**5)[:, None] * goal
-    qvel = (30 * FEW**2 - 60 * FEW**3 + 30 * FEW**4)[:, None] * goal / 5.0
-    return qpos.astype(np.float32), qvel.astype(np.float32)
 
 
 def arrays(locked, limits="none"):
@@ -57,8 +49,8 @@ def solve(arms, qpos, qvel):
     return jax.vmap(of_arm)(arms)
 
 
-def solved(arms, seed=0):
-    motion = (np.stack([padded(row) for row in x]).astype(np.float32) for x in demonstration(seed))
+def solved(arms):
+    motion = (np.stack([padded(row) for row in x]).astype(np.float32) for x in demonstration(7))
     return jax.tree.map(np.asarray, solve(arms, *motion))
 
 
@@ -77,7 +69,7 @@ def test_the_bound_is_that_of_the_arm_compiled_in(batch, row):
         for joints, limits in (((), "none"), (locked, limits))
     )
     metric = MetricConfig(hand_rotation=0.0).build(expert, learner).arguments  # arms as arrays have no hand
-    expected = np.asarray(mimic.kinematic_bound(expert, learner, *demonstration(0), **metric))
+    expected = np.asarray(mimic.kinematic_bound(expert, learner, *demonstration(7), **metric))
     actual = batch[1].distance[row]
     # Both are results of a search, from other random poses; here both find the same poses. What is left is how near
     # velocities come to kinks: 2e-6, and 1.4e-4 without their refinement.

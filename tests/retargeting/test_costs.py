@@ -159,14 +159,6 @@ def test_smoothness_derivatives_equal_automatic_ones(x64):
 
 
 @pytest.mark.slow
-def test_without_weights_the_result_is_the_same_to_the_bit():
-    plain = imitate_pose(EXPERT, LEARNER, QPOS, **METRIC, **FEW)
-    jax.tree.map(
-        np.testing.assert_array_equal, plain, imitate_pose(EXPERT, LEARNER, QPOS, **METRIC, **FEW, costs=Costs())
-    )
-
-
-@pytest.mark.slow
 def test_each_cost_of_a_pose_falls_where_it_has_a_weight():
     """And with it the sum of distance and cost: the optimum of the sum is below that of the distance alone."""
     bounded = dataclasses.replace(LEARNER, joint_range=np.array([[-1.0, 1.0], [-1.0, 1.0]]))

@@ -4,10 +4,8 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
-from mimic.arms.embodiment import panda, planar_arm
-from mimic.metric.config import MetricConfig
+from mimic.arms.embodiment import planar_arm
 from mimic.metric.correspondence import arc_length_correspondence
 from mimic.metric.distance import DistanceWeights
 from mimic.retargeting.optimizers import Solution
@@ -62,13 +60,3 @@ def test_the_first_pose_lies_within_half_a_revolution():
     qpos = np.linspace(3.5, 4.5, 6)[:, None]
     motion = imitate_trajectory(arm, arm, qpos, np.eye(1), DistanceWeights(rotation=1.0), starts=1)
     np.testing.assert_allclose(motion.qpos, qpos - 2 * np.pi, atol=1e-3)  # float32, at a flat minimum
-
-
-@pytest.mark.slow
-def test_an_equal_arm_moves_as_the_expert():
-    arm = panda(limits="hardware")
-    phases = np.arange(0, 3, 0.05)[:, None] + np.arange(7)
-    qpos = (0.41 * np.sin(phases) + [0, 0.6, 0, -1.5, 0, 1.5, 0]).astype(np.float32)
-    motion = imitate_trajectory(arm, arm, qpos, **MetricConfig().build(arm, arm).arguments)
-    assert np.all(motion.converged)
-    np.testing.assert_allclose(motion.qpos, qpos, atol=1e-4)

@@ -1,6 +1,5 @@
 """rosbag2: the library of others reads typed messages of what is written, and bags of others are read."""
 
-import dataclasses
 import sqlite3
 import sys
 from typing import Any
@@ -8,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import mimic
 from mimic.motions.formats.rosbag2 import is_rosbag2, read_rosbag2, write_rosbag2
 from tests.helpers.episodes import COUNT, DT, EXPERT, LEARNER, STEPS, episodes, motions
 
@@ -133,7 +131,7 @@ def test_bags_of_others_are_read(tmp_path, plugin, velocity, stamp, step):
         assert motion.qvel is None
 
 
-def driver(path, *, stamp=lambda i: 1.7e9 + i / 100, speed=1.0, twice=False, velocity=1.0):
+def driver(path, *, stamp=lambda i: 1.7e9 + i / 100, speed=1.0, twice=False):
     """A bag as a driver records it: 2 s of a swing at 100 Hz, and each tenth time a message of the gripper alone."""
     types = STORE.types
     header, time = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
@@ -142,7 +140,7 @@ def driver(path, *, stamp=lambda i: 1.7e9 + i / 100, speed=1.0, twice=False, vel
         for i in range(200):
             now = round(stamp(i) * SECOND)
             head, recorded = header(time(now // SECOND, now % SECOND), ""), round((1.7e9 + i / 100 / speed) * SECOND)
-            angle, rate = 0.5 * np.sin(i / 50), velocity * np.cos(i / 50)
+            angle, rate = 0.5 * np.sin(i / 50), np.cos(i / 50)
             arm = types[TYPE](head, ["a", "b"], np.array([angle, 0]), np.array([rate, 0]), np.full(2, np.nan))
             gripper = types[TYPE](head, ["finger"], np.array([0.01 * i]), np.zeros(1), np.zeros(1))
             for copy in range(1 + twice):
@@ -173,15 +171,6 @@ def test_bags_of_drivers_and_simulations(tmp_path, settings, notes):
     np.testing.assert_allclose(motion.qpos[:, 0], 0.5 * np.sin(2 * SAMPLES))
     assert recording.notes == notes and recording.gripper == ("finger",) and motion.gripper is not None
     np.testing.assert_allclose(motion.gripper[:191, 0], SAMPLES[:191], atol=1e-6)  # between messages linear
-
-
-@pytest.mark.parametrize("velocity", [0.0, np.nan])
-def test_velocities_that_no_sensor_has_measured_are_computed(tmp_path, velocity):
-    bag = driver(tmp_path / "bag", velocity=velocity)
-    arm = dataclasses.replace(mimic.planar_arm([0.5, 0.5]), joint_names=("a", "b"))
-    demonstrations, notes = mimic.import_demonstrations(bag, arm, horizon=10)
-    np.testing.assert_allclose(demonstrations.qvel[0, :, 0], np.cos(0.2 * np.arange(11)), atol=1e-3)
-    assert any(line.startswith("velocities computed, since the source's are no") for line in notes)
 
 
 def test_a_clock_that_starts_anew_starts_a_new_motion(tmp_path):

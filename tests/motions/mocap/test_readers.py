@@ -82,14 +82,13 @@ def test_up_is_found_from_the_body(tmp_path, expected, up):
     np.testing.assert_allclose(motion.positions, expected.positions, atol=1e-9)
 
 
-@pytest.mark.parametrize(("separator", "time"), [(",", "time"), (";", "Time (s)")])
-def test_csv(tmp_path, expected, separator, time):
+def test_csv(tmp_path, expected):
     """A cell without a number is a point that was not seen."""
-    header = [time, *(f"{name}_{axis}" for name in expected.names for axis in "xyz")]
+    header = ["Time (s)", *(f"{name}_{axis}" for name in expected.names for axis in "xyz")]
     values = np.concatenate([np.arange(SAMPLES)[:, None] / RATE, expected.positions.reshape(SAMPLES, -1)], axis=1)
     rows = [header, *(list(map(str, row)) for row in values)]
     rows[8][1:4] = "---"
-    (tmp_path / "clip.csv").write_text("\n".join(map(separator.join, rows)))
+    (tmp_path / "clip.csv").write_text("\n".join(map(";".join, rows)))
     motion, seen = read_motion(tmp_path / "clip.csv"), expected.positions.copy()
     seen[7, 0] = np.nan
     _assert_person(motion, dataclasses.replace(expected, positions=seen))
