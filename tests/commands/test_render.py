@@ -26,7 +26,6 @@ from mimic.motions.mocap.link_motion import LinkMotion
 STEPS = 2  # of a motion: 0.2 s, 7 frames
 EVERY = 3  # frames from one sample to the next, 0.1 s at 30 frames a second
 ROUNDING = 1e-5  # of distances of about 1 in float32
-BASE = [0.1, 0.2, 0.0, 0.5]
 
 
 def swings(arm):
@@ -36,8 +35,8 @@ def swings(arm):
     return {f"motion {phase}": Motion(time, qpos, None) for phase, qpos in enumerate(angles)}
 
 
-def saved(folder, arms) -> dict[str, Any]:
-    save_motions(folder, arms, swings(arms[0]), swings(arms[1]), BASE)
+def saved(folder, arms, base=None) -> dict[str, Any]:
+    save_motions(folder, arms, swings(arms[0]), swings(arms[1]), base)
     return {"retargeted": str(folder), "compilation_cache": ""}
 
 
@@ -79,7 +78,6 @@ def test_a_turned_base_counts_in_all_measures():
 @pytest.mark.slow
 def test_retargeted_motions_are_shown_as_they_are(plan):
     clip, env = plan.compute(), env_config("planar4dof")
-    assert clip.base == BASE
     arms = env.build_arms().embodiments
     for shown, arm in zip(clip.poses, arms, strict=True):
         assert len(shown) == len(clip.time) == EVERY * STEPS + 1
@@ -96,6 +94,13 @@ def test_retargeted_motions_are_shown_as_they_are(plan):
     for name, expected in similarity(*lines).items():
         assert clip.similarity[name].shape == clip.time.shape
         assert clip.similarity[name][frame] == pytest.approx(float(expected), rel=1e-4)  # degrees in float32
+
+
+@pytest.mark.slow
+def test_the_learner_is_shown_where_it_stands(files, tmp_path):
+    base = [0.1, 0.2, 0.0, 0.5]
+    keys = files | saved(tmp_path, env_config("planar4dof").build_arms().embodiments, base)
+    assert prepare_clip(RenderConfig(**keys)).compute().base == base
 
 
 def test_frames_show_both_arms_and_the_time(plan):
