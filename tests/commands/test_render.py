@@ -21,7 +21,8 @@ from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line, similarity
 from mimic.motions.formats.episodes import Motion
 from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
-from mimic.motions.mocap.link_motion import LinkMotion
+from mimic.motions.mocap.link_motion import arm_motion
+from tests.helpers.bodies import person
 
 STEPS = 2  # of a motion: 0.2 s, 7 frames
 EVERY = 3  # frames from one sample to the next, 0.1 s at 30 frames a second
@@ -155,23 +156,16 @@ def test_bad_files_are_rejected_in_one_line(files, changes, message):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("parents", [(-1, 0), (-1, -1)], ids=["one arm", "two arms"])
-def test_motions_of_an_expert_from_a_file(tmp_path, parents):
+@pytest.mark.parametrize("side", ["right", "both"])
+def test_motions_of_an_expert_from_a_file(tmp_path, side):
     """As a person's, of one arm or of both."""
-    motion = LinkMotion(("a", "b"), parents, *_moving_links(), 10.0, "person")
+    motion = arm_motion(person(5), side)
     model = tmp_path / "person.xml"
     model.write_text(ball_chain_xml(motion, zero_frames(motion)))
-    person = mimic.load_mjcf(model, tip=[ALL_ENDS])
-    keys = saved(tmp_path, (person, mimic.panda()))
+    expert = mimic.load_mjcf(model, tip=[ALL_ENDS])
+    keys = saved(tmp_path, (expert, mimic.panda()))
     plan = prepare_clip(RenderConfig(**keys, expert=str(model), learner="panda"))
-    assert plan.env.build_arms().expert.embodiment.joint_names == person.joint_names
-
-
-def _moving_links():
-    """Start and end of two links over time."""
-    points = np.cumsum([[0, 0, 0], [0.3, 0, 0], [0.2, 0.1, 0]], axis=0) + np.zeros((5, 1, 1))
-    points[:, 2, 2] = 0.02 * np.arange(5)
-    return points[:, :-1], points[:, 1:]
+    assert plan.env.build_arms().expert.embodiment.joint_names == expert.joint_names
 
 
 @pytest.mark.parametrize(

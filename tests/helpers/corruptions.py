@@ -90,8 +90,10 @@ def _write_lerobot(root: Path, version: str, episodes: list[Episode], names: lis
     names = [f"{name}.pos" for name in names] + ["gripper.pos"] * has_gripper
     vector = {"dtype": "float32", "shape": [len(names)], "names": names}
     features: dict[str, Any] = {"observation.state": vector, "action": vector}
-    features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in ("frame_index", "episode_index")}
-    features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+    indices = "frame_index", "episode_index", "index"
+    features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in indices}
+    scalars = [key for key in episodes[0] if "." in key]  # such as next.reward
+    features |= {name: {"dtype": "float32", "shape": [1], "names": None} for name in ("timestamp", *scalars)}
     if "hand" in episodes[0]:
         features["observation.ee_pos"] = {"dtype": "float32", "shape": [3], "names": ["x", "y", "z"]}
     lengths = [len(episode["time"]) for episode in episodes]
@@ -111,7 +113,9 @@ def _write_lerobot(root: Path, version: str, episodes: list[Episode], names: lis
         tables.append(pa.table({
             **{key: pa.array(list(x.astype(np.float32)), pa.list_(pa.float32())) for key, x in vectors.items()},
             "frame_index": np.arange(count), "episode_index": np.full(count, number),
+            "index": sum(lengths[:number]) + np.arange(count),
             "timestamp": episode["time"].astype(np.float32),
+            **{name: episode[name].astype(np.float32) for name in scalars},
         }))  # fmt: skip
     if version == "v2.1":
         for number, table in enumerate(tables):

@@ -13,6 +13,7 @@ from mimic.motions.formats.episodes import Motion
 from mimic.motions.formats.replacing import replaced_columns
 from mimic.motions.importing import read_source
 from mimic.motions.rewriting import read_data_set, write_data_set
+from tests.helpers.corruptions import write
 from tests.helpers.real_data import ROBOSUITE, needs
 
 EXPERT = dataclasses.replace(mimic.planar_arm([0.3, 0.3, 0.2]), joint_range=np.array([[-2.0, 2.0]] * 3))
@@ -72,37 +73,22 @@ def test_columns_are_called_as_those_before(names, old, expected):
 def lerobot(root, version):
     """A data set in degrees with an action that leads, a gripper, a reward, a video file and statistics."""
     pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
-    names = [f"{name}.pos" for name in (*OLD, "gripper")]
-    features = {
-        "observation.state": {"dtype": "float32", "shape": [4], "names": {"motors": names}},
-        "action": {"dtype": "float32", "shape": [4], "names": names},
-        "next.reward": {"dtype": "float32", "shape": [1], "names": None},
-        "observation.images.front": {"dtype": "video", "shape": [4, 4, 3], "names": ["h", "w", "c"]},
-        **{name: {"dtype": "int64", "shape": [1], "names": None} for name in ("frame_index", "episode_index", "index")},
-        "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-    }
-    (root / "meta").mkdir(parents=True)
-    info = {"codebase_version": version, "robot_type": "old", "fps": RATE, "features": features, "total_episodes": 3,
-            "total_frames": sum(COUNTS), "splits": {"train": "0:2", "test": "2:3"}, "total_videos": 3}  # fmt: skip
-    (root / "meta/info.json").write_text(json.dumps(info))
-    tables = []
+    episodes = []
     for episode, count in enumerate(COUNTS):
         time, qpos = expert_motion(count)
-        state = np.degrees(np.c_[qpos, np.radians(50 + 40 * np.sin(3 * time))])
-        action = np.degrees(np.c_[qpos + 0.02, np.radians(50 + 40 * np.sin(3 * time))])
-        tables.append(pa.table({
-            "observation.state": pa.array(state.astype(np.float32).tolist(), pa.list_(pa.float32())),
-            "action": pa.array(action.astype(np.float32).tolist(), pa.list_(pa.float32())),
-            "next.reward": pa.array(np.arange(count, dtype=np.float32) + 100 * episode),
-            "frame_index": np.arange(count), "episode_index": np.full(count, episode),
-            "index": sum(COUNTS[:episode]) + np.arange(count), "timestamp": (time).astype(np.float32),
-        }))  # fmt: skip
-    data = root / "data/chunk-000"
-    data.mkdir(parents=True)
+        rewards, opening = np.arange(count) + 100.0 * episode, 50 + 40 * np.sin(3 * time)[:, None]
+        angles = {"qpos": np.degrees(qpos), "action": np.degrees(qpos + 0.02), "gripper": opening}
+        episodes.append({"time": time, **angles, "next.reward": rewards})
+    write(root, version, episodes)
+    info = json.loads((root / "meta/info.json").read_text())
+    state = info["features"]["observation.state"]
+    state["names"] = {"motors": state["names"]}
+    info["features"]["observation.images.front"] = {"dtype": "video", "shape": [4, 4, 3], "names": ["h", "w", "c"]}
+    info |= {"robot_type": "old", "splits": {"train": "0:2", "test": "2:3"}, "total_videos": 3}
+    (root / "meta/info.json").write_text(json.dumps(info))
     if version.startswith("v2"):
         (root / "videos/chunk-000/front").mkdir(parents=True)
-        for episode, table in enumerate(tables):
-            pq.write_table(table, data / f"episode_{episode:06d}.parquet")
+        for episode in range(3):
             (root / f"videos/chunk-000/front/episode_{episode:06d}.mp4").write_bytes(b"video %d" % episode)
         rows = [{"episode_index": k, "tasks": ["t"], "length": count} for k, count in enumerate(COUNTS)]
         (root / "meta/episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
@@ -110,7 +96,6 @@ def lerobot(root, version):
                  for k in range(3)]  # fmt: skip
         (root / "meta/episodes_stats.jsonl").write_text("".join(json.dumps(row) + "\n" for row in stats))
     else:
-        pq.write_table(pa.concat_tables(tables), data / "file-000.parquet")
         folder = root / "meta/episodes/chunk-000"
         folder.mkdir(parents=True)
         ends = np.cumsum(COUNTS)
