@@ -95,12 +95,16 @@ def test_a_gap_in_the_other_arm_splits_nothing(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_printed_command_trains(both):
-    folder, printed = both
+def test_the_printed_command_trains_the_same_learner_on_the_clip(written, monkeypatch):
+    folder, printed = written
+    monkeypatch.chdir(folder)
     (words,) = printed_words(printed, "train on it", "train")
-    small = ["trainer.num_timesteps=4096", "trainer.num_envs=16", "trainer.batch_size=16", "trainer.evaluations=1"]
-    run("train", *words, *small, "env.physics=fused", "run_dir=run", folder=folder)
-    assert (folder / "run" / "report.json").is_file()
+    env, demonstrations = compose("train", *words).env, mimic.load_demonstrations(folder / "left.npz")
+    assert env.learner == mimic.env_config("panda7dof", learner={"locked": [7]}).learner
+    expert, learner = env.build_arms().embodiments
+    demonstrations.check_fits(expert, env.control_dt, env.horizon)
+    assert learner.num_joints == 6 and env.demonstrations.path == "left.npz"
+    assert env.demonstrations.count + env.demonstrations.held_out == demonstrations.count
 
 
 def test_inspect_shows_what_a_clip_has(clip, tmp_path):
