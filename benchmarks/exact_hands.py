@@ -111,17 +111,6 @@ def ssik_solver(arm: Embodiment) -> tuple[Any, np.ndarray]:
     return solver, homogeneous(arm.hand_rotation[0].T, np.zeros(3))
 
 
-def all_postures(arm: Embodiment) -> Callable[[np.ndarray], np.ndarray]:
-    """ssik: from a hand pose [4, 4] to the postures [postures, joints] of all branches; samples of a redundant arm."""
-    solver, back = ssik_solver(arm)
-
-    def solve(target: np.ndarray) -> np.ndarray:
-        solutions = solver.solve(target @ back, enumerate_windings=False)
-        return np.reshape([solution.q for solution in solutions], (-1, arm.num_joints))
-
-    return solve
-
-
 def closed_form(arm: Embodiment) -> Callable[..., np.ndarray | None]:
     """ssik: from a hand pose [4, 4] and a seed to the nearest solution, None where there is none."""
     solver, back = ssik_solver(arm)

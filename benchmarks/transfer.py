@@ -19,10 +19,6 @@ Teleoperation: in DATA/teleop/so101_to_piper an SO-101 leads a Piper joint by jo
 leader's joints become a data set of the Piper by `hand=near`, within the data sheet's speeds; the leader's hand is what
 both are judged by.
 
-Frames that fail: in each run of them, the frame whose hand needs the fastest joint. ssik samples all postures with
-this hand, and `speed` is the least of them: of the fastest joint, as a fraction of its limit, with the best use of a
-redundant joint. Above 1, or without a posture, the hand cannot be exact there and at the next time from this base.
-
 In physics, `success` is robosuite's at the end; `exact` and `speed` are of what is commanded. Beside mimic, from the
 same base: the solution of `ssik` nearest to the last one, `mink`'s quadratic program from the last one, and `copied`
 joints.
@@ -43,12 +39,11 @@ from typing import Any
 import h5py
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from benchmarks.common import measured_code
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
-from benchmarks.exact_hands import SPEEDS, all_postures, as_numbers, followed_by_mink, followed_by_ssik, homogeneous
+from benchmarks.exact_hands import SPEEDS, as_numbers, followed_by_mink, followed_by_ssik, homogeneous
 from benchmarks.teleoperation import BASE, SPEED, arm, hand_errors, recordings
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.compile_check import VELOCITY_LIMIT
@@ -60,19 +55,16 @@ from mimic.commands.retarget import prepare_retargeting
 from mimic.envs.config import EnvConfig
 from mimic.motions.importing import read_source
 from mimic.motions.units import in_rad
-from mimic.retargeting.hand_speeds import hand_jacobians
 from mimic.retargeting.hand_target import placement
 
 ARMS = "ur5e", "iiwa14", "gen3", "jaco", "xarm7"
 METHODS = "mimic", "ssik", "mink", "copied"
 TASKS = "lift", "stack", "nut-assembly", "pick-place", "door"
 PAIRS = "learner task frames exact mm:.3f deg:.3f speed:.2f margin_deg:.1f depth_mm:.1f gripper ok seconds:.0f"
-FAILING = "learner task first last frame postures speed:.2f"
 PHYSICS = "learner task method success objects exact:.1% speed:.1f tracking_error_rad:.3f"
 TELEOPERATION = "method episodes frames position_mm_p50:.1f position_mm_p95:.1f hand_direction_deg:.2f"
 _SITE, _EPISODE = "gripper0_right_grip_site", "data/demo_1"
 _WITHOUT_REDUNDANCY = 6  # joints
-_NEAR = 5  # frames before a run of failing ones that may be its cause, and between two of them that count as one
 _POSES = 100  # random ones, in which links that always touch are found
 
 
@@ -183,56 +175,6 @@ def pair_row(options: argparse.Namespace, expert: Model, name: str, learner: Mod
     return as_numbers({**row, "seconds": report["seconds"], "base": report["base"], "failures": causes})
 
 
-def failing_rows(options: argparse.Namespace, expert: Model, learner: Model, row: Row) -> Iterator[Row]:
-    """What each run of frames that fail needs at its hardest frame."""
-    out, name = Path(options.work) / f"{row['task']}_{row['learner']}", row["learner"]
-    (episode,) = json.loads((out / "report.json").read_text())["episodes"]
-    with h5py.File(Path(options.demonstrations) / row["task"] / "demo.hdf5") as file:
-        states = np.asarray(file[f"{_EPISODE}/states"], float)
-    arm = build_arm(ArmConfig(model=str(with_speeds(options.folder, name))), "hardware").embodiment
-    hands = of_arm(arm, learner, targets(expert, states[:, 1:8], row["base"]))
-    dt = float(np.median(np.diff(states[:, 0])))
-    postures_of, limits = all_postures(arm), np.array(SPEEDS[name])
-    runs: list[list[int]] = []
-    for failure in episode["failures"]:
-        if runs and failure["first"] <= runs[-1][1] + _NEAR:
-            runs[-1][1] = failure["last"]
-        else:
-            runs.append([failure["first"], failure["last"]])
-    for first, last in runs:
-        found: list[tuple[float, int, int]] = []
-        for frame in range(max(first - _NEAR, 0), min(last, len(hands) - 2) + 1):
-            postures, (now, then) = postures_of(hands[frame]), hands[frame : frame + 2]
-            turn = Rotation.from_matrix(then[:3, :3] @ now[:3, :3].T).as_rotvec()
-            twist = np.concatenate([then[:3, 3] - now[:3, 3], turn]) / dt
-            speed = least_speed(hand_jacobians(arm, postures)[:, 0], twist, limits) if len(postures) else np.inf
-            found.append((speed, frame, len(postures)))
-        speed, frame, count = max(found)
-        needs = {"frame": frame, "postures": count, "speed": speed if count else None}
-        yield as_numbers({"learner": name, "task": row["task"], "first": first, "last": last, **needs})
-
-
-def least_speed(jacobians: np.ndarray, twist: np.ndarray, limits: np.ndarray) -> float:
-    """The least of some postures: speed of the fastest joint, as a fraction of its limit, for a velocity of the hand.
-
-    Args:
-      jacobians: [postures, 6, joints] of arms with six joints, or seven.
-      twist: [6] linear and angular velocity [m/s, rad/s].
-      limits: [joints] [rad/s].
-    """
-    scaled = jacobians * limits
-    needed = np.linalg.pinv(scaled) @ twist
-    if len(limits) == _WITHOUT_REDUNDANCY:
-        return float(np.abs(needed).max(axis=1).min())
-    free = np.linalg.svd(scaled)[2][:, -1]  # the speeds at which the hand stands
-    i, k = np.triu_indices(len(limits))
-    # With the best of these two joints are equally fast, or one stands.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        amounts = [(s * needed[:, k] - needed[:, i]) / (free[:, i] - s * free[:, k]) for s in (1, -1)]
-        speeds = needed[:, None] + np.concatenate(amounts, axis=1)[..., None] * free[:, None]
-        return float(np.nanmin(np.abs(speeds).max(axis=-1)))
-
-
 def round_trip(options: argparse.Namespace, expert: Model, name: str) -> Row:
     """The Panda's lift on an arm, back on the Panda, and again on the arm."""
     work, panda, arm = Path(options.work), Path(options.folder) / "panda/panda.xml", with_speeds(options.folder, name)
@@ -341,13 +283,12 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     Path(options.work).mkdir(parents=True, exist_ok=True)
     expert = Model(Path(options.folder) / "panda/panda.xml")
-    content: dict[str, list[Row]] = {"pairs": [], "failing": [], "round_trip": [], "physics": []}
+    content: dict[str, list[Row]] = {"pairs": [], "round_trip": [], "physics": []}
     for name in options.arms:
         learner = Model(Path(options.folder) / name / f"{name}.xml")
         for task in options.tasks:
             measure = functools.partial(pair_row, options, expert, name, learner, task)
             content["pairs"].append(kept(options, Path(options.work) / f"{task}_{name}.json", measure))
-            content["failing"] += failing_rows(options, expert, learner, content["pairs"][-1])
             write_results(options, **content)
             print_table(content["pairs"][-1:], PAIRS)
         if "lift" in options.tasks and len(learner.range) == _WITHOUT_REDUNDANCY:
@@ -365,7 +306,6 @@ def main(arguments: list[str] | None = None) -> None:
         content["teleoperation"] = kept(options, path, lambda: list(teleoperation(options)))
     write_results(options, **content)
     print_table(content["pairs"], PAIRS, "pairs")
-    print_table(content["failing"], FAILING, "frames that fail")
     print_table(content["round_trip"], "learner mm:.4f deg:.4f expert_rad:.4f learner_rad:.4f", "round trip of lift")
     print_table(content.get("teleoperation", []), TELEOPERATION, "teleoperation")
     print_table(content["physics"], PHYSICS, "physics")
