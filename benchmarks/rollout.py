@@ -1,10 +1,10 @@
-"""Simulation speed: steps per second of the physics, of whole environment steps, and of their parts.
+"""Simulation speed: steps per second of the physics, and of whole environment steps.
 
-    python -m benchmarks.rollout --out FILE [--envs panda7dof ...] [--arms 512 8192 ...] [--cases fused MJX-Warp ...]
+    python -m benchmarks.rollout --out FILE [--envs panda7dof ...] [--arms 512 8192 ...] [--cases fused mjx ...]
 
 Every case makes control steps of 0.1 s under random torques. The physics of the environments, `fused` and `mjx`, is
-compared with a loop that carries `mjx.Data`, MJX-Warp, where it is installed, and C MuJoCo's threaded rollout on the
-CPU; whole environment steps with the stock one, which carries and resets `mjx.Data`, as brax environments usually do.
+compared with a loop that carries `mjx.Data`, and with C MuJoCo's threaded rollout on the CPU; whole environment steps
+with the stock one, which carries and resets `mjx.Data`, as brax environments usually do.
 """
 
 import itertools
@@ -57,10 +57,10 @@ def own_physics(physics: str, env: ImitationEnv, arms: int) -> Timing:
     return time_steps(lambda state, torques: (many(*state, torques), None), (qpos, qvel), torques)
 
 
-def carried_data(implementation: str, env: ImitationEnv, arms: int) -> Timing:
+def carried_data(env: ImitationEnv, arms: int) -> Timing:
     """`mjx.step`, from one `mjx.Data` to the next."""
     model = stock.model_with_substeps(env)
-    mjx_model, blank = (make(model, impl=implementation) for make in (mjx.put_model, mjx.make_data))
+    mjx_model, blank = (make(model, impl="jax") for make in (mjx.put_model, mjx.make_data))
     qpos, qvel, torques = random_motion(env, arms)
     data = jax.vmap(lambda q, v: blank.replace(qpos=q, qvel=v))(qpos, qvel)
     substep = jax.vmap(lambda d: mjx.step(mjx_model, d))
@@ -100,32 +100,14 @@ def environment(kind: str, env: ImitationEnv, arms: int) -> Timing:
     return time_steps(step, state, actions)
 
 
-def part(name: str, env: ImitationEnv, arms: int) -> Timing:
-    qpos, qvel, torques = random_motion(env, arms)
-    started = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.PRNGKey(0), arms))
-    functions = {
-        "reward": lambda arm: env.distance(arm.qpos, arm.qvel, arm.demonstration, arm.step),
-        "observation": lambda arm: jnp.sum(env.observe(arm)),
-        "new episode": lambda arm: jax.tree.reduce(lambda total, x: total + jnp.sum(x), env.start(arm.key)),
-    }
-
-    def step(state: Any, torque: jax.Array) -> Any:
-        state = state.replace(qpos=state.qpos + 1e-3 * torque, step=state.step + 1)
-        return state, jax.vmap(functions[name])(state)
-
-    return time_steps(step, started.replace(qpos=qpos, qvel=qvel), torques)
-
-
 CASES: dict[str, dict[str, Case]] = {
     "physics": {
         "fused": partial(own_physics, "fused"),
         "mjx": partial(own_physics, "mjx"),
-        "mjx.Data carried": partial(carried_data, "jax"),
-        "MJX-Warp": partial(carried_data, "warp"),
+        "mjx.Data carried": carried_data,
         "C MuJoCo, all cores": mujoco_threads,
     },
     "environment": {kind: partial(environment, kind) for kind in ("fused", "mjx", "stock")},
-    "part": {name: partial(part, name) for name in ("reward", "observation", "new episode")},
 }
 NAMES = tuple(dict.fromkeys(case for cases in CASES.values() for case in cases))
 
@@ -142,7 +124,7 @@ def run(envs: Sequence[str], sizes: Sequence[int], names: Sequence[str]) -> Iter
                 steps = arms * STEPS * (env.config.substeps if group == "physics" else 1)
                 rates = {"steps_per_s": steps / timing.median, "bytes_per_arm": timing.bytes / arms}
                 yield {**row, **timing.summary(), **rates}
-            except Exception as error:  # a peer that is not installed or out of memory
+            except Exception as error:  # out of memory
                 yield {**row, **failure(error)}
 
 
