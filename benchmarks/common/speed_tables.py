@@ -35,8 +35,8 @@ def speeds(
     start = {row["what"]: row["median_s"] for row in startup["rows"]}
     poses = large(one(pose["results"], pair="panda 7->4")["methods"]["newton"]["poses_per_second"])
     goals = {run["report"]["env"]: run["to_goal_s"] for run in mapper["runs"]}
-    ppo = one(scaling["rows"], scaling="weak", devices=1)["steps_per_s"]
-    several = [one(rows["rows"], scaling="weak", processes=count) for rows, count in ((scaling, 2), (four, 4))]
+    ppo = one(scaling["rows"], devices=1)["steps_per_s"]
+    several = [one(rows["rows"], processes=count) for rows, count in ((scaling, 2), (four, 4))]
     tip = one(accuracy["results"][0]["candidates"], engine="fused", substeps=10)["error_mm"]["end"]
     return [
         ("what", "measured", "target"),
