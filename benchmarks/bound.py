@@ -1,4 +1,4 @@
-"""Steps at which the kinematic bound misses the global minimum, by how much, and its cost.
+"""Steps at which the kinematic bound misses the global minimum, and by how much.
 
     python -m benchmarks.bound --out FILE [--case NAME] [--seeds 0 1 2]
 
@@ -6,11 +6,9 @@ The reference of a step is the minimum of three searches: the bound itself, Adam
 expert's own angles (200 iterations; the best four refined by 300 more), and `closest_motion` with more starts, more
 iterations and another seed. A step is missed if the bound exceeds its reference by 1e-3 in the metric's unit, or by
 0.1 % and 1e-5. "paper" is the paper's metric with merged links, "hard" has hard correspondence and adaptive weights.
-The cost is that of 156 demonstrations, as at the start of a training.
 """
 
 import dataclasses
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,7 +34,6 @@ STARTS, ITERATIONS, KEPT, REFINEMENT = 64, 200, 4, 300  # of the reference
 STEP_SIZES = 0.1, 0.02  # [rad], and for velocities in units of the expert's
 MINIMUM_SPEED = 1e-2  # rad/s
 MORE: dict[str, Any] = {"starts": 16, "iterations": 40, "seed": 1}
-COST_CASE, COST_DEMONSTRATIONS = "panda4dof, default", 156
 COUNTS = "steps", "missed_absolute", "missed_relative"
 COLUMNS = "case steps missed_absolute missed_relative largest_excess:.1e mean_reference:.4f"
 
@@ -128,28 +125,14 @@ def run_case(name: str, seeds: Sequence[int]) -> Row:
     return {**row, **missed(bound, reference), "searches": searches}
 
 
-def measure_cost() -> Row:
-    """Cost of the bound at the start of a training: wall time, and that of all cores together."""
-    motion = motions(CASES[COST_CASE], COST_DEMONSTRATIONS, 0)
-    clocks = [(time.perf_counter(), time.process_time())]
-    function = bound_function(CASES[COST_CASE]).lower(*motion).compile()
-    clocks.append((time.perf_counter(), time.process_time()))
-    jax.block_until_ready(function(*motion))
-    clocks.append((time.perf_counter(), time.process_time()))
-    seconds = np.diff(clocks, axis=0).round(2).ravel().tolist()
-    costs = dict(zip(("compile_s", "compile_cpu_s", "run_s", "run_cpu_s"), seconds, strict=True))
-    return {"demonstrations": COST_DEMONSTRATIONS, "steps": COST_DEMONSTRATIONS * STEPS, **costs}
-
-
 def main() -> None:
     options = make_parser("bound", __doc__, case=CASES, seeds=[0, 1, 2]).parse_args()
-    cost, rows = measure_cost(), []
+    rows = []
     for name in options.case:
         rows.append(run_case(name, options.seeds))
         total = {key: sum(row[key] for row in rows) for key in COUNTS}
-        write_results(options, cost=cost, total=total, results=rows)
+        write_results(options, total=total, results=rows)
     print_table(rows, COLUMNS)
-    print(cost)
 
 
 if __name__ == "__main__":
