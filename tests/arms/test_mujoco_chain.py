@@ -275,11 +275,6 @@ MODELS = {
         {},
         "expected a chain or a tree; .* number 1$",
     ),
-    "all joints coupled": (
-        lambda: toy(TIP, '<equality><joint joint1="a" joint2="b"/></equality>'),
-        {},
-        "expected joints that move on their own; 'a' and 'b' of the arm are coupled",
-    ),
     "unknown base": (lambda: toy(TIP), {"base": "C"}, "the model has no body 'C'; valid are A, B$"),
     "unknown tip": (
         lambda: toy(TIP),

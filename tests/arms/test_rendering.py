@@ -26,11 +26,10 @@ def test_a_missing_graphics_library_is_one_line(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("error", ["AttributeError('no eglQueryString')", "ctypes.ArgumentError('no glGetError')"])
-def test_a_missing_graphics_library_is_reported_when_something_is_drawn(error, tmp_path):
-    """PyOpenGL fails in these ways where there is no libEGL, and no libGL."""
+def test_a_missing_graphics_library_is_reported_when_something_is_drawn(tmp_path):
+    """PyOpenGL fails in this way where there is no libGL."""
     (tmp_path / "OpenGL").mkdir()
-    (tmp_path / "OpenGL" / "__init__.py").write_text(f"import ctypes\nraise {error}")
+    (tmp_path / "OpenGL" / "__init__.py").write_text("import ctypes\nraise ctypes.ArgumentError('no glGetError')")
     code = "from mimic import ArmConfig, ArmScene; import mujoco.mjx; ArmScene([ArmConfig()])"
     found = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}", "MUJOCO_GL": "egl"}
     ended = subprocess.run([sys.executable, "-c", code], env=found, capture_output=True, text=True, check=False)
@@ -79,13 +78,10 @@ def test_videos_are_plain_where_the_cpu_renders(monkeypatch, is_software):
             assert bool(scene._model.vis.quality.offsamples) == (not is_plain)
 
 
-@pytest.mark.slow_for("panda")
-@pytest.mark.parametrize("config", [ArmConfig(), PLANAR], ids=["panda", "planar"])
-def test_fitted_arms_fill_the_image(config):
+def test_fitted_arms_fill_the_image():
     """The arms at rest and bent, with a margin: a part of the background on all sides, and no wide empty frame."""
-    joints = 7 if config.model == "panda" else 2
-    motion = np.linspace(0, 0.7, 5)[:, None] * np.ones(joints)
-    with ArmScene([config, config], width=240, height=160) as scene:
+    motion = np.linspace(0, 0.7, 5)[:, None] * np.ones(2)
+    with ArmScene([PLANAR, PLANAR], width=240, height=160) as scene:
         scene.fit([motion, -motion])
         images = np.stack([scene.image([pose, -pose]) for pose in motion]).astype(int)
         left, right = scene.centres()

@@ -16,7 +16,6 @@ GENERATED = {
     "torso": (torso(2), TORSO_TIPS, {}),
     "torso with a locked waist and elbow": (torso(), TORSO_TIPS, {"waist": 0.4, "left_joint1": -0.3}),
     "hand of 19 joints": (hand(), ["*"], {}),
-    "locked hand": (hand(), ["*"], {"wrist": 0.2, "thumb_0": 0.5, "index_2": -0.3}),
 }
 
 
@@ -29,7 +28,6 @@ def poses(arm, count=2, seed=0):
     return rng.uniform(-1, 1, (count, arm.num_joints)), rng.normal(size=(count, arm.num_joints))
 
 
-@pytest.mark.slow_for("locked hand")
 @pytest.mark.parametrize("name", GENERATED)
 def test_link_states_are_those_of_mujoco(x64, name):
     text, tips, locked = GENERATED[name]

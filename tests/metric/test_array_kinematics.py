@@ -1,4 +1,4 @@
-"""Link states of any arm against those of its embodiment, and their derivatives."""
+"""Link states of any arm against C MuJoCo, as constants and as data of one function, and their derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +9,9 @@ import mimic
 from mimic.arms.arrays import MAX_JOINTS, lock_joints
 from mimic.arms.sampler import random_arm
 from mimic.metric.correspondence import arc_length_correspondence
-from mimic.metric.kinematics import axes_and_origins, frame_table, link_states, states_in_frames
+from mimic.metric.kinematics import axes_and_origins, frame_table, link_state_table, link_states, states_in_frames
 from mimic.retargeting.array_nearest import link_jacobians
+from tests.helpers import random_arms
 from tests.helpers.array_cases import Batch, random_source
 
 # 1e-16 of each step from base to tip, times speeds of up to 30 rad/s; link lengths round at 1e-16 of a metre too.
@@ -27,6 +28,17 @@ def batch():
 def states(batch):
     with jax.enable_x64(True):
         return jax.tree.map(np.asarray, jax.jit(jax.vmap(link_states))(batch.arrays, batch.qpos, batch.qvel))
+
+
+def test_link_states_are_those_of_mujoco(batch, states):
+    for i, (source, arm, (qpos, qvel, *_)) in enumerate(zip(batch.sources, batch.arms, batch.motions, strict=True)):
+        embodiment = arm.embodiment
+        expected = random_arms.links(source, random_arms.posed(source, qpos, qvel), embodiment.link_names)
+        constant = link_state_table(embodiment, qpos, qvel, float)
+        for name, values in expected.items():
+            unit = embodiment.chain_length if name in ("position", "linear_velocity") else 1.0
+            for actual in (getattr(constant, name), getattr(states, name)[i, : embodiment.num_links]):
+                np.testing.assert_allclose(unit * actual, values, rtol=0, atol=ATOL)
 
 
 def test_empty_slots_of_links_rest_at_the_base(batch, states):

@@ -17,7 +17,7 @@ from mimic.metric.kinematics import hand_frames, link_state_table, link_states
 from mimic.metric.motion_distance import motion_distance
 from mimic.retargeting.pose import imitate_pose
 from mimic.retargeting.pose_objective import automatic_derivatives, pose_objective
-from tests.helpers.original_model import package_file, ur_like, urdf
+from tests.helpers.original_model import ur_like, urdf
 
 # Few joints and links, which compile quickly; the last joint is the one about the hand's axis.
 EXPERT = mimic.panda(locked=[1, 3, 5], links="merged")
@@ -61,14 +61,11 @@ def test_the_kernel_and_its_gradient_equal_automatic_differentiation(x64):
     assert all(np.abs(gradient).max() > 1e-3 for gradient in both[0][1])
 
 
-@pytest.mark.slow_for("False")
-@pytest.mark.parametrize("as_data", [False, True])
-def test_the_derivatives_of_the_pose_search_equal_automatic_differentiation(x64, as_data):
-    """1e-3: lengths are smoothed by 1e-3 chain lengths, which these poses are far from."""
-    matrix, learner = np.asarray(arc_length_correspondence(EXPERT, LEARNER)), LEARNER
-    if as_data:
-        arm = build_arm(ArmConfig(locked=LOCKED), "none", "merged")
-        learner = arm_arrays(arm, slots=(LEARNER.num_joints, LEARNER.num_links))
+def test_the_derivatives_of_the_pose_search_equal_automatic_differentiation(x64):
+    """Of an arm as data. 1e-3: lengths are smoothed by 1e-3 chain lengths, which these poses are far from."""
+    matrix = np.asarray(arc_length_correspondence(EXPERT, LEARNER))
+    arm = build_arm(ArmConfig(locked=LOCKED), "none", "merged")
+    learner = arm_arrays(arm, slots=(LEARNER.num_joints, LEARNER.num_links))
     metric = Metric(matrix, LINKS, hand_weights=ALL)
     qpos, _, learner_qpos, _ = (x[0] for x in motion())
     states, objective = link_states(EXPERT, qpos), pose_objective(learner, metric)
@@ -82,17 +79,13 @@ def test_the_derivatives_of_the_pose_search_equal_automatic_differentiation(x64,
         np.testing.assert_allclose(np.ravel(columns), np.ravel(expected.hessian[row][: row + 1]), atol=1e-3)
 
 
-ROBOTS = "robosuite/models/assets/robots"
 ARMS = {
     "panda": lambda _: mimic.panda(),
     "pair": lambda _: load_mjcf(panda_path("panda_pair"), tip=["left_tcp", "right_tcp"]),
     "planar": lambda _: mimic.planar_arm([0.3, 0.2, 0.1]),
     "MJCF": lambda _: load_mjcf(MjModel.from_xml_string(ur_like())),
     "URDF": lambda folder: _read_urdf(folder / "four.urdf"),
-} | {
-    f"robosuite {name}": lambda _, name=name: load_mjcf(package_file(f"{ROBOTS}/{name}/robot.xml"), tip="right_hand")
-    for name in ("panda", "ur5e", "iiwa", "kinova3", "jaco", "sawyer", "xarm7", "baxter")
-}  # fmt: skip
+}
 
 
 def _read_urdf(file):

@@ -22,7 +22,7 @@ from mimic.metric.kinematics import (
     resting_link_states,
 )
 from tests.helpers import random_arms
-from tests.helpers.trees import TORSO_TIPS, hand, torso
+from tests.helpers.trees import TORSO_TIPS, torso
 
 # Against MuJoCo, in m, m/s and rad/s. Arms are up to 3 m long and move at up to 10 rad/s and 10 m/s.
 TOLERANCE = {
@@ -78,22 +78,22 @@ def assert_moves_as_in_mujoco(arm, model, dtype, locked=None):
         np.testing.assert_allclose(twists[:, part], in_link_frame, err_msg=f"body twist, {field}", **close)
 
 
-@pytest.mark.slow_for(
-    *(f"{dtype}-{seed}" for seed in random_arms.SEEDS for dtype in ("float32", "float64") if seed > 7)
-)
-@pytest.mark.slow_for(*(f"float32-{seed}" for seed in range(7)))
-@pytest.mark.parametrize("seed", random_arms.SEEDS)
-def test_random_arms_move_as_in_mujoco(dtype, seed):
+@pytest.mark.parametrize("seed", range(8))
+def test_random_arms_move_as_in_mujoco(x64, seed):
     model = random_arms.random_arm(seed)
     arm = load_mjcf(model)
     assert arm.num_joints == model.njnt
-    assert_moves_as_in_mujoco(arm, model, dtype)
+    assert_moves_as_in_mujoco(arm, model, np.dtype("float64"))
+
+
+def test_a_random_arm_moves_as_in_mujoco_in_single_precision():
+    model = random_arms.random_arm(7)
+    assert_moves_as_in_mujoco(load_mjcf(model), model, np.dtype("float32"))
 
 
 @pytest.mark.parametrize("locked", [{}, {"joint1": 0.3, "joint7": -0.5}], ids=["free", "locked"])
-@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
-def test_long_arms_move_as_in_mujoco(x64, seed, locked):
-    model = random_arms.random_arm(seed, joints=LONG + 8)
+def test_long_arms_move_as_in_mujoco(x64, locked):
+    model = random_arms.random_arm(3, joints=LONG + 8)
     arm = load_mjcf(model, locked=locked, links="kept")
     assert arm.num_joints == LONG + 8 - len(locked) > LONG
     assert (-1 in arm.link_joint) == bool(locked)
@@ -110,22 +110,29 @@ def test_long_arms_take_both_precisions_in_one_process():
             assert {leaf.dtype for leaf in jax.tree.leaves(actual)} == {dtype}
 
 
-@pytest.mark.slow_for(*(f"float32-{locked}-{links}" for locked in PANDA_LOCKED for links in ("merged", "kept")))
-@pytest.mark.slow_for("float64-free-merged", "float64-3dof-kept", "float64-base-merged", "float64-tip only-kept")
-@pytest.mark.parametrize("links", ["merged", "kept"])
-@pytest.mark.parametrize("locked", PANDA_LOCKED.values(), ids=PANDA_LOCKED)
-def test_panda_moves_as_in_mujoco(dtype, locked, links):
-    model = read_model(panda_path())
-    arm = panda(locked=locked, links=links)
-    assert_moves_as_in_mujoco(arm, model, dtype, dict(locked) if isinstance(locked, dict) else None)
+@pytest.mark.parametrize(
+    ("links", "locked"),
+    [
+        ("kept", "free"),
+        ("kept", "4dof"),
+        ("merged", "4dof"),
+        ("merged", "3dof"),
+        ("kept", "base"),
+        ("kept", "angles"),
+        ("merged", "angles"),
+        ("merged", "tip only"),
+    ],
+)
+def test_panda_moves_as_in_mujoco(x64, links, locked):
+    joints = PANDA_LOCKED[locked]
+    arm, angles = panda(locked=joints, links=links), joints if isinstance(joints, dict) else None
+    assert_moves_as_in_mujoco(arm, read_model(panda_path()), np.dtype("float64"), angles)
 
 
-@pytest.mark.slow_for("merged-6", "kept-6", "kept-4")
-@pytest.mark.parametrize("seed", [4, 6, 17])
 @pytest.mark.parametrize("links", ["merged", "kept"])
-def test_locked_random_arm_moves_as_in_mujoco(x64, seed, links):
-    model = random_arms.random_arm(seed)
-    rng = np.random.default_rng(seed)
+def test_locked_random_arm_moves_as_in_mujoco(x64, links):
+    model = random_arms.random_arm(17)
+    rng = np.random.default_rng(17)
     locked = {f"joint{i + 1}": rng.uniform(-3, 3) for i in rng.permutation(model.njnt)[: model.njnt // 2]}
     arm = load_mjcf(model, locked=locked, links=links)
     assert arm.num_joints == model.njnt - len(locked)
@@ -195,9 +202,9 @@ def test_a_batch_is_a_vmap_is_a_loop(function):
         jax.tree.map(lambda a, b, k=k: np.testing.assert_array_equal(a[k, 0], b), batch, first)
 
 
-@pytest.mark.slow_for("18-body_twists", "18-forward_kinematics")
-@pytest.mark.parametrize("function", [forward_kinematics, link_states, body_twists])
-@pytest.mark.parametrize("joints", [3, LONG + 2])
+@pytest.mark.parametrize(
+    ("function", "joints"), [(forward_kinematics, 3), (link_states, 3), (body_twists, 3), (link_states, LONG + 2)]
+)
 def test_jit_takes_the_arm_as_an_argument(function, joints):
     arm = load_mjcf(random_arms.random_arm(11, joints))
     (qpos, *_), (qvel, *_) = (x.astype(np.float32) for x in motions(joints))
@@ -261,7 +268,6 @@ def test_wrong_shapes_are_rejected(unchecked, shape):
     [
         panda(locked=(3, 6, 7)),
         load_mjcf(mujoco.MjModel.from_xml_string(torso()), tip=TORSO_TIPS),
-        pytest.param(load_mjcf(mujoco.MjModel.from_xml_string(hand()), tip=["*"]), marks=pytest.mark.slow),
     ],
     ids=lambda arm: arm.name,
 )

@@ -24,18 +24,16 @@ PERIODS = 50
 FIELDS = {"limits": "hardware", "control_dt": 0.05, "world": {"gravity": True, "stops": True}}
 
 
-NAMES = ["panda7dof", "panda4dof"]
-
-
-def make_arm_and_plant(name: str):
-    config = env_config(name, **FIELDS)
+def make_arm_and_plant():
+    """A Panda of which three joints are locked."""
+    config = env_config("panda4dof", **FIELDS)
     arm = build_arm(config.learner, config.limits)
     return arm, plant_of(config, arm)
 
 
-@pytest.fixture(scope="module", params=NAMES)
-def arm_and_plant(request):
-    return make_arm_and_plant(request.param)
+@pytest.fixture(scope="module")
+def arm_and_plant():
+    return make_arm_and_plant()
 
 
 def draw_for(joints: int, seed: int = 0) -> Draw:
@@ -129,7 +127,6 @@ def targets_for(arm, plant, mode: str, ticks: int):
     return [joint_control.action_target(mode, action, reference, parameters, np) for action in actions]
 
 
-@pytest.mark.slow_for(*(f"panda7dof-{mode}" for mode in MODES if mode != "joint_position"))
 @pytest.mark.parametrize("mode", MODES)
 def test_a_second_is_that_of_c_mujoco(arm_and_plant, mode):
     """With gravity, payload, friction, damping, PD control and errors of gain and angle; float32."""
@@ -150,10 +147,8 @@ def test_a_second_is_that_of_c_mujoco(arm_and_plant, mode):
     assert np.abs(np.stack(rows) - expected).max() < 1e-4  # rad, the target of the project
 
 
-@pytest.mark.slow_for("panda7dof")
-@pytest.mark.parametrize("name", NAMES)
-def test_in_double_precision_only_rounding_is_left(name, x64):
-    arm, plant = make_arm_and_plant(name)
+def test_in_double_precision_only_rounding_is_left(x64):
+    arm, plant = make_arm_and_plant()
     draw, targets = draw_for(arm.embodiment.num_joints, 1), targets_for(arm, plant, "joint_position", 5)
     expected = simulate_in_mujoco(arm, plant, draw, "joint_position", targets)
     loop, state = jax.jit(make_inner_loop("joint_position", plant.constants, PERIODS)), start_of(arm, np.float64)
@@ -163,7 +158,6 @@ def test_in_double_precision_only_rounding_is_left(name, x64):
     np.testing.assert_allclose(state.qpos, expected[-1], rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow_for("panda7dof-joint_velocity")
 @pytest.mark.parametrize("mode", [pytest.param("torque", marks=pytest.mark.slow), "joint_velocity"])
 def test_the_kernel_equals_the_arrays(arm_and_plant, mode, interpreted):
     """The GPU kernel, interpreted, on a batch with a partial block."""
@@ -184,7 +178,6 @@ def test_the_kernel_equals_the_arrays(arm_and_plant, mode, interpreted):
         np.testing.assert_allclose(values, reference, rtol=2e-4, atol=2e-4)  # float32, sums in another order
 
 
-@pytest.mark.slow_for("panda7dof")
 def test_the_kernel_lowers_without_a_gpu(arm_and_plant):
     arm, plant = arm_and_plant
     home, episode = start_of(arm, np.float32), plant.episode(draw_for(arm.embodiment.num_joints))
@@ -192,7 +185,6 @@ def test_the_kernel_lowers_without_a_gpu(arm_and_plant):
     assert "triton" in gpu_program(jax.jit(jax.vmap(make_inner_loop("joint_velocity", plant.constants, 2))), *batch)
 
 
-@pytest.mark.slow_for("panda7dof")
 def test_stops_hold_an_arm_that_is_driven_into_them(arm_and_plant):
     """At the maximum torque; a stop is a spring, which gives way a little."""
     arm, plant = arm_and_plant

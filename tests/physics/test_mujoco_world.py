@@ -13,7 +13,7 @@ from mimic.metric.capsule_distances import clearance_constants
 from mimic.physics.mujoco_world import disabled, loaded_fields, mujoco_world
 from mimic.physics.world import WorldConfig
 from tests.helpers.array_cases import acceleration
-from tests.physics.test_inner_loop import NAMES, draw_for, make_arm_and_plant, mujoco_model
+from tests.physics.test_inner_loop import draw_for, make_arm_and_plant, mujoco_model
 
 TILTED = """<mujoco><worldbody><body name="base" pos="1 2 3" quat="0.9 0.3 0.1 0.2">
 <body pos="0 0 .2"><joint name="a" axis="0 0 1"/><geom type="capsule" fromto="0 0 0 0 0 .3" size=".05"/>
@@ -33,11 +33,9 @@ def loaded(world, draw) -> mujoco.MjModel:
     return model
 
 
-@pytest.mark.slow_for("panda7dof")
-@pytest.mark.parametrize("name", NAMES)
-def test_a_load_is_that_of_a_payload_within_the_last_body(name):
+def test_a_load_is_that_of_a_payload_within_the_last_body():
     """A point mass: no inertia of its own. What is left is rounding."""
-    arm, _ = make_arm_and_plant(name)
+    arm, _ = make_arm_and_plant()
     draw, rng = draw_for(arm.embodiment.num_joints), np.random.default_rng(0)
     ours = loaded(mujoco_world(arm, WorldConfig(gravity=True)), draw)
     qpos, qvel = rng.normal(size=(2, arm.embodiment.num_joints))
@@ -45,9 +43,9 @@ def test_a_load_is_that_of_a_payload_within_the_last_body(name):
     np.testing.assert_allclose(acceleration(ours, qpos, qvel, 0), expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("floor_height", [-0.3])
-def test_gravity_is_vertical_and_the_floor_is_that_of_the_base(tmp_path, floor_height):
+def test_gravity_is_vertical_and_the_floor_is_that_of_the_base(tmp_path):
     """Where the base is tilted, too; the floor is the one of the safety layer and of the costs."""
+    floor_height = -0.3
     (tmp_path / "tilted.xml").write_text(TILTED)
     config = ArmConfig(model=str(tmp_path / "tilted.xml"), base="base")
     arm, capsules, qpos = build_arm(config), fit_capsules(config), np.array([0.4, 1.2])
