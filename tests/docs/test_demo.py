@@ -11,7 +11,6 @@ import pytest
 
 import mimic
 from mimic.retargeting.pose_baselines import copy_joints
-from mimic.trainers.pretrained.network import pretrained_names
 from tests.helpers.repository import REPOSITORY
 
 DEMO = REPOSITORY / "docs" / "demo"
@@ -36,9 +35,9 @@ def script_of(name):
     return f"mimicDemo.add({json.dumps(module.demo_data(name))});"
 
 
-@pytest.mark.slow_for(*(name for name in pretrained_names("pose_mapper") if name != "planar4dof"))
+@pytest.mark.slow_for("panda4dof")
 @pytest.mark.skipif(NODE is None, reason="the JavaScript of the demo needs node")
-@pytest.mark.parametrize("name", pretrained_names("pose_mapper"))
+@pytest.mark.parametrize("name", ["planar4dof", "panda4dof"])
 def test_javascript_computes_what_jax_computes(name):
     mapper = mimic.load(name, "pose_mapper")
     model = mapper.function.model  # type: ignore[attr-defined]

@@ -5,8 +5,6 @@ import re
 import pytest
 
 import mimic
-from mimic.trainers import run_training as train
-from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from tests.helpers.pages import PAGES, REPOSITORY, Block, check, commands, module, read_blocks, run_page
 
 DOCS = REPOSITORY / "docs"
@@ -29,27 +27,6 @@ def test_the_example_of_the_readme_runs():
 
 def test_the_readme_is_short():
     assert len((REPOSITORY / "README.md").read_text().split()) <= 700
-
-
-@pytest.mark.slow
-def test_the_example_of_the_library_runs():
-    scope: dict = {}
-    exec(python(DOCS / "library.md")[0], scope)  # noqa: S102 - our own text
-    assert scope["bound"].shape == (scope["demonstrations"].horizon + 1,)
-    assert scope["gradient"].shape == (4,)
-
-
-@pytest.mark.slow
-def test_the_examples_on_poses_run(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    settings = {"samples": 256, "batch_size": 128, "epochs": 1, "hidden_layers": [8], "held_out_poses": 32}
-    trainer = PoseMapperConfig(**settings, evaluations=1, validation_poses=32)
-    config = TrainConfig(mimic.env_config("panda4dof"), trainer, run_dir="runs/panda4dof", compilation_cache="")
-    assert train.prepare_training(config, 0.0)() == 0
-    scope: dict = {}
-    exec("\n".join(python(DOCS / "static_pose_imitation.md")), scope)  # noqa: S102 - our own text
-    assert scope["solution"].qpos.shape == (100, 4) and scope["learner_poses"].shape == (10, 4)
-    assert scope["followed"].qpos.shape == (50, 4)
 
 
 @pytest.mark.slow_for(

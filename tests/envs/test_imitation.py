@@ -21,30 +21,17 @@ def planar_env():
 
 
 OF_MANY_ARMS = ("any_arm", "panda_family")
-QUICK = ("planar4dof", "panda3dof")  # the others have all their shapes checked
+QUICK = ("planar4dof", "panda3dof")
 
 
-@pytest.mark.slow_for("any_arm", "panda_family", "pair", "panda4dof", "planar7dof")
+@pytest.mark.slow_for(*(name for name in mimic.environments() if name not in QUICK))
 @pytest.mark.parametrize("name", mimic.environments())
-def test_every_environment_has_its_shapes(name):
-    env = mimic.make(name, demonstrations=FEW)
-    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-    assert state.obs.shape == (env.observation_size,)
-    after = jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
-    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
-
-
-@pytest.mark.slow_for("planar4dof-none")
-@pytest.mark.parametrize("limits", ["none", "hardware"])
-@pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in mimic.environments()]
-)
-def test_every_environment_resets_and_steps(name, limits):
-    # MJX takes longest to compile; other tests hold each arm's motion under it against MuJoCo's.
-    physics = "mjx" if name == "planar4dof" and limits == "none" else "fused"
-    env = mimic.make(name, demonstrations=FEW, limits=limits, physics=physics)
+def test_every_environment_resets_and_steps(name):
+    env = mimic.make(name, demonstrations=FEW, limits="hardware", physics="fused")
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     after = jax.jit(env.step)(state, jnp.zeros(env.action_size))
+    assert after.obs.shape == (env.observation_size,)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert np.all(np.isfinite(after.obs)) and not after.done
     if name in OF_MANY_ARMS:  # the reward is relative to the zero action
         assert after.reward == 0 < after.metrics["distance"] < 1.1 * after.pipeline_state.hold

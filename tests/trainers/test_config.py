@@ -61,6 +61,10 @@ BAD = {
         lambda: PoseMapperConfig(batch_size=1000).resolve("cpu"),
         "expected a divisor of samples = 65536, got 1000",
     ),
+    "preset": (
+        lambda: PoseMapperConfig(preset="any_arm").resolve("cpu"),
+        "trainer.preset: expected one of auto, paper, large, got 'any_arm'",
+    ),
     "heads": (lambda: PoseMapperConfig(heads=0), "trainer.heads: expected a whole number from 1 to 1,000, got 0"),
     "horizon": (
         lambda: TrainConfig(mimic.env_config("any_arm", horizon=10), PoseMapperConfig()).check_used(),

@@ -164,26 +164,11 @@ def test_limited_joints_stay_within_their_limits():
         mapper(np.array([3.0, 0, 0, -1, 0, 1, 0]))
 
 
-@pytest.mark.parametrize("name", ["any_arm", "panda_family"])
-def test_an_environment_that_draws_its_learner_is_rejected(reason, name):
-    assert reason("train", "trainer=pose_mapper", f"env={name}") == (
-        f"trainer: expected ppo where the learner is drawn for each episode, env={name}, got pose_mapper, which has "
+def test_an_environment_that_draws_its_learner_is_rejected(reason):
+    assert reason("train", "trainer=pose_mapper", "env=any_arm") == (
+        "trainer: expected ppo where the learner is drawn for each episode, env=any_arm, got pose_mapper, which has "
         "one learner; imitate_pose takes any arm as data, without a training"
     )
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"batch_size": 48}, "trainer.batch_size: expected a divisor of samples = 8192, got 48"),
-        ({"preset": "any_arm"}, "trainer.preset: expected one of auto, paper, large, got 'any_arm'"),
-        ({"learning_rate": 0.0}, "trainer.learning_rate: expected a number above 0 and at most 1, got 0.0"),
-        ({"learning_rate": float("inf")}, "trainer.learning_rate"),
-    ],
-)
-def test_bad_settings_are_rejected(settings, message):
-    with pytest.raises(ValueError, match=message):
-        PoseMapperConfig(**{**SMALL, **settings}).resolve()
 
 
 @pytest.mark.parametrize(
@@ -213,8 +198,9 @@ def test_a_mapper_of_other_arms_or_of_no_run_is_rejected(trained, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("env", ["planar4dof", "planar7dof", "panda7dof", "panda4dof", "panda3dof"])
-def test_the_large_preset_is_within_2_percent_of_the_optimum(env, tmp_path):
-    config = TrainConfig(env_config(env), PoseMapperConfig(), run_dir=str(tmp_path / "run"), compilation_cache="")
+def test_the_large_preset_is_within_2_percent_of_the_optimum(tmp_path):
+    config = TrainConfig(
+        env_config("panda4dof"), PoseMapperConfig(), run_dir=str(tmp_path / "run"), compilation_cache=""
+    )
     assert session.prepare_training(config, 0.0)() == 0
     assert json.loads((tmp_path / "run" / "report.json").read_text())["quality"]["held_out"] <= 0.02

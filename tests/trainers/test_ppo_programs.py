@@ -95,10 +95,7 @@ def test_a_loss_without_gradient_changes_nothing_but_the_episodes(one_batch):
     assert not np.array_equal(before.episodes.obs, after.episodes.obs)
 
 
-@pytest.mark.parametrize(
-    ("time", "entropy_cost"),
-    [(7, 0.0), pytest.param(40, 0.0, marks=pytest.mark.slow), pytest.param(1, 0.3, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize(("time", "entropy_cost"), [(7, 0.0), pytest.param(1, 0.3, marks=pytest.mark.slow)])
 def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     """The entropy is that of a sample, drawn in the same order only for unrolls of one step."""
     sizes, unrolls = (5, 3), 6
@@ -176,10 +173,10 @@ def test_a_privileged_critic_observes_more_than_the_policy(x64):
 
 
 ON_TWO_DEVICES = """
-import sys, jax, numpy as np, mimic
+import jax, numpy as np, mimic
 from mimic.trainers.ppo import ppo
 from mimic.trainers.config import PPOConfig
-env = mimic.make("planar4dof", physics=sys.argv[1], demonstrations={"count": 3, "held_out": 1})
+env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 3, "held_out": 1})
 config = PPOConfig(num_envs=8, unroll_length=2, batch_size=8, num_minibatches=2, num_updates_per_batch=2,
                    hidden_layers=[8]).resolve("cpu", 2)
 start, _, epoch = ppo.compile_training(env, config, 2)
@@ -197,13 +194,11 @@ assert not np.array_equal(*observed)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("physics", ["fused", "mjx"])
-def test_devices_see_different_arms_and_learn_the_same(physics):
+def test_devices_see_different_arms_and_learn_the_same():
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
     settings = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
-    ended = subprocess.run(
-        [sys.executable, "-c", ON_TWO_DEVICES, physics], env=settings, capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-c", ON_TWO_DEVICES]
+    ended = subprocess.run(command, env=settings, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr[-2000:]
 
 

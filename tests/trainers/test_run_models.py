@@ -183,7 +183,7 @@ def test_a_moved_run_is_evaluated_without_the_file_of_its_arm(tmp_path):
 
 @pytest.mark.slow
 def test_commands_use_the_arm_of_a_moved_run(tmp_path):
-    """Training, evaluation, export, video and resuming, without the original file."""
+    """Training, evaluation and resuming, without the original file."""
     file = tmp_path / "arm.xml"
     file.write_text(TWO_JOINTS)
     arguments = [f"env.learner.model={file}", *TINY, f"run_dir={tmp_path / 'first'}", "compilation_cache="]
@@ -195,14 +195,8 @@ def test_commands_use_the_arm_of_a_moved_run(tmp_path):
     again = json.loads((tmp_path / "out" / "report.json").read_text())
     assert again["mean_distance"] == pytest.approx(report["mean_distance"], rel=1e-5)  # float32, in another process
     file.unlink()
-    assert not command("export", f"run={run_dir}", f"out={tmp_path / 'policy.onnx'}").returncode
-    assert not command("render", f"run={run_dir}", f"out={tmp_path / 'video.mp4'}").returncode
     assert not command("train", f"resume={run_dir}", "trainer.num_timesteps=8000", "trainer.evaluations=1").returncode
     assert load_config(run_dir, saved_models=False).env.learner.model == str(file)
-    append(run_dir / MODELS / "learner" / "arm.xml")
-    for name in ("evaluate", "export", "render"):
-        error = command(name, f"run={run_dir}", f"out={tmp_path / name}").stderr
-        assert error.startswith("error: ") and error.count("\n") == 1 and "was changed since" in error
 
 
 @pytest.fixture

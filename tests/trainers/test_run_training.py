@@ -254,8 +254,8 @@ def test_a_folder_that_another_process_has_taken_is_not_written(finished, tmp_pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("limit", [2000, 30_000])  # bytes of a file: the events, and a checkpoint
-def test_a_full_disk_is_one_line(finished, tmp_path, limit):
+def test_a_full_disk_is_one_line(finished, tmp_path):
+    limit = 30_000  # bytes of a file: less than a checkpoint
     run_dir = shutil.copytree(finished[0], tmp_path / "run")
     (run_dir / "report.json").unlink()
     before = checkpoint_steps(run_dir)
@@ -308,7 +308,7 @@ ENDLESS = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(number, tmp_path):
     run_dir = tmp_path / "stopped"
     process = start("train", *TINY, f"run_dir={run_dir}", *ENDLESS)
@@ -322,16 +322,15 @@ def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(number, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_second_signal_leaves_no_partial_checkpoint(number, tmp_path):
+def test_a_second_signal_leaves_no_partial_checkpoint(tmp_path):
     run_dir = tmp_path / "stopped"
     process = start("train", *TINY, f"run_dir={run_dir}", *ENDLESS)
     wait_for(run_dir, "config.yaml", process)
     for pause in (0.4, 0.0):
-        process.send_signal(number)
+        process.send_signal(signal.SIGINT)
         time.sleep(pause)
     _, error = process.communicate(timeout=120)
-    assert process.returncode == 128 + number and error.splitlines()[1:] == [f"stopped by {number.name}"], error
+    assert process.returncode == 128 + signal.SIGINT and error.splitlines()[1:] == ["stopped by SIGINT"], error
     assert all(path.name.isdigit() for path in run_dir.glob("checkpoints/*"))
 
 
