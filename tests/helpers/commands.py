@@ -4,6 +4,7 @@ import contextlib
 import functools
 import importlib
 import io
+import socket
 import subprocess
 import sys
 import time
@@ -41,6 +42,13 @@ def start(name: str, *arguments: Any, **more: Any) -> subprocess.Popen[str]:
     """Starts a command in a process of its own."""
     words = [sys.executable, "-m", f"mimic.{name}", *map(str, arguments)]
     return subprocess.Popen(words, **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **more})
+
+
+def free_port() -> int:
+    """A port of this machine that no process listens at."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
 
 def wait_for(folder: Path, pattern: str, *processes: subprocess.Popen[str], count: int = 1) -> None:

@@ -5,7 +5,6 @@ import io
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ from PIL import Image
 from mimic.envs import env_config
 from mimic.trainers import run_training as train
 from mimic.trainers.config import PPOConfig, TrainConfig
+from tests.helpers.commands import free_port
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 MISSING = [name for name in ("viser", "playwright") if importlib.util.find_spec(name) is None]
@@ -53,10 +53,7 @@ def serve():
     started = []
 
     def start(*arguments):
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
-        command = [sys.executable, "-m", "mimic.view", f"port={port}", *arguments]
+        command = [sys.executable, "-m", "mimic.view", f"port={free_port()}", *arguments]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         started.append(process)
         assert process.stdout is not None

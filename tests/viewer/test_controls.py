@@ -1,7 +1,6 @@
 """The controls of a live view on a page: which joints are locked, and what is drawn of it."""
 
 import importlib.util
-import socket
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,15 +16,13 @@ from mimic.viewer.controls import LiveControls
 from mimic.viewer.live_session import Frame, LiveSession
 from mimic.viewer.manual_controls import ManualControls
 from mimic.viewer.timeline import TimeControls, Timeline
+from tests.helpers.commands import free_port
 
 
 @pytest.fixture
 def serve():
     """Shows something on a page of the environment panda4dof, to the end."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        config = ViewConfig(env=env_config("panda4dof"), port=probe.getsockname()[1])
-    done = []
+    config, done = ViewConfig(env=env_config("panda4dof"), port=free_port()), []
 
     def serve_once(show):
         def show_once(page, times):

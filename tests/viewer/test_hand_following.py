@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.util
-import socket
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from mimic.retargeting.teleoperation import TeleoperationStatus
 from mimic.viewer.hand_following import HandDrag, HandFollower, HandFrame, HandSettings
 from mimic.viewer.live_session import LiveSession
 from tests.helpers import original_model
+from tests.helpers.commands import free_port
 
 TICK = 1 / 30
 HOME = np.array([0, -0.8, 0, -2.4, 0, 1.6, 0.8], np.float32)
@@ -149,10 +149,7 @@ def test_the_page_has_a_handle_a_tab_and_goals(env):
     from mimic.viewer.live_session import Frame
     from mimic.viewer.manual_controls import ManualControls
 
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        config = ViewConfig(env=env, port=probe.getsockname()[1])
-    done = []
+    config, done = ViewConfig(env=env, port=free_port()), []
 
     def show(page, times):
         session = LiveSession(env, hand=HandSettings("exact"))

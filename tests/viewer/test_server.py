@@ -19,6 +19,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
 from mimic.viewer.server import _LoopEvent, make_server
+from tests.helpers.commands import free_port
 
 PROTOCOL = f"viser-v{viser.__version__}"
 CAMERA = {
@@ -31,10 +32,7 @@ encode = msgspec.msgpack.encode
 
 @pytest.fixture(scope="module")
 def served():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    server = make_server("127.0.0.1", port)
+    server = make_server("127.0.0.1", free_port())
     values = []
     slider = server.gui.add_slider("joint", -1.0, 1.0, 0.01, 0.0)
     slider.on_update(lambda event: values.append(event.target.value) if event.client else None)

@@ -68,8 +68,7 @@ def test_random_actions_are_safe(tmp_path, loop):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("loop", LOOPS)
-@pytest.mark.parametrize("mode", ["joint_velocity", "joint_position"])
+@pytest.mark.parametrize(("mode", "loop"), zip(["joint_velocity", "joint_position"], LOOPS, strict=True))
 def test_many_random_actions_are_safe(tmp_path, mode, loop):
     check_safe(adversarial_episodes(tmp_path / "bundle", mode, 50, seed=11, loop=loop))
 

@@ -6,7 +6,6 @@ import os
 import pathlib
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -15,28 +14,21 @@ import time
 import jax
 import pytest
 
-import mimic
 from mimic import train
 from mimic.commands import cli
-from mimic.runs.checkpoints import save_checkpoint
 from mimic.runs.distributed import process_group
 from mimic.runs.distributed.local_processes import LocalProcess, LocalProcesses, local_process
 from mimic.runs.distributed.process_group import DistributedConfig, ProcessGroup
-from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo.ppo import initial_params, make_networks
-from tests.helpers.commands import command, schemas, wait_for
+from tests.helpers.commands import command, free_port, schemas, wait_for
 from tests.helpers.commands import start as start_command
-from tests.helpers.tiny import SHORT_ARMS, TINY
+from tests.helpers.tiny import TINY
 
 LONG = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"  # with many checkpoints
 
 
 def start(tmp_path, *arguments, slurm=False):
     """Starts two processes of one training, each with its own CPU device."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    processes = []
+    port, processes = free_port(), []
     for index in range(2):
         environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
         found = [f"distributed.coordinator=127.0.0.1:{port}", "distributed.processes=2", f"distributed.process={index}"]
@@ -80,18 +72,6 @@ def test_the_variables_of_slurm_are_enough(tmp_path):
     (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run", "trainer.evaluations=1", slurm=True))
     assert (first, second) == (0, 0), shown[-2000:] + silent[-2000:]
     assert json.loads((tmp_path / "run" / "report.json").read_text())["hardware"]["processes"] == 2
-
-
-@pytest.mark.slow
-def test_the_first_process_reports_a_divergence(tmp_path):
-    env = mimic.make("planar4dof", **SHORT_ARMS, physics="fused", demonstrations={"count": 1, "held_out": 1})
-    networks = make_networks(PPOConfig(hidden_layers=[16]).resolve(), env.observation_size, env.action_size)
-    statistics, policy, value = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))
-    (tmp_path / "start").mkdir()
-    save_checkpoint(tmp_path / "start", 0, (statistics, jax.tree.map(lambda x: 1e30 * x, policy), value))
-    (first, shown), (second, silent) = finish(start(tmp_path, "init=start", "run_dir=run"))
-    assert (first, second) == (3, 3), shown[-2000:] + silent[-2000:]
-    assert "the checkpoints before it are kept in run\n" in shown and "diverged" not in silent
 
 
 def alone(tmp_path, *arguments):

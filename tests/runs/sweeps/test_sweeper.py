@@ -145,11 +145,7 @@ def test_the_same_sweep_continues(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("path", ["runs/a-b.c", "my runs/it's, a=b", "~/x"])
-def test_any_path_is_an_override(path):
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
-    (override,) = OverridesParser.create().parse_overrides([setting("run_dir", path)])
-    assert override.value() == path and not override.is_sweep_override()
+def test_the_path_of_a_run_is_read_from_its_override(path):
     assert path_of(setting("run_dir", path)) == path
 
 
