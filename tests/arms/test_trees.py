@@ -23,11 +23,6 @@ def tree(text=None, tips=TORSO_TIPS, **options):
     return load_mjcf(mujoco.MjModel.from_xml_string(text or torso()), tip=tips, **options)
 
 
-def poses(arm, count=2, seed=0):
-    rng = np.random.default_rng(seed)
-    return rng.uniform(-1, 1, (count, arm.num_joints)), rng.normal(size=(count, arm.num_joints))
-
-
 @pytest.mark.parametrize("name", GENERATED)
 def test_link_states_are_those_of_mujoco(x64, name):
     text, tips, locked = GENERATED[name]
@@ -75,21 +70,6 @@ def test_both_arms_hang_on_the_torso():
     assert "neck" not in arm.joint_names
     shared = set(arm.chains[0]) & set(arm.chains[1])
     assert {arm.link_names[link] for link in shared} == {"base-waist"}
-
-
-def test_locked_joints_of_a_tree_keep_the_link_states():
-    locked = {"waist": 0.3, "left_joint1": -0.4}
-    free, held = tree(), tree(locked=locked)
-    (qpos,), (qvel,) = poses(free, 1)
-    for name, angle in locked.items():
-        qpos[free.joint_names.index(name)], qvel[free.joint_names.index(name)] = angle, 0
-    kept = [free.joint_names.index(name) for name in held.joint_names]
-    for a, b in zip(
-        jax.tree.leaves(link_state_table(free, qpos, qvel, float)),
-        jax.tree.leaves(link_state_table(held, qpos[kept], qvel[kept], float)),
-        strict=True,
-    ):
-        np.testing.assert_allclose(a, b, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import pytest
 
 import mimic
 from mimic.retargeting.pose_baselines import copy_joints
+from tests.helpers.metric_cases import random_poses
 from tests.helpers.repository import REPOSITORY
 
 DEMO = REPOSITORY / "docs" / "demo"
@@ -41,7 +42,7 @@ def script_of(name):
 def test_javascript_computes_what_jax_computes(name):
     mapper = mimic.load(name, "pose_mapper")
     model = mapper.function.model  # type: ignore[attr-defined]
-    poses = random_poses(mapper.expert)
+    poses = random_poses(mapper.expert, POSES).astype(float)
     computed = in_node(script_of(name), poses)
     with jax.enable_x64(True):
         params = jax.tree.map(lambda x: np.asarray(x, np.float64), mapper.function.params)  # type: ignore[attr-defined]
@@ -53,11 +54,6 @@ def test_javascript_computes_what_jax_computes(name):
         np.testing.assert_allclose([result[key]["qpos"] for result in computed], pose, atol=1e-5)
         np.testing.assert_allclose(shown_distance(computed, key), distances[key], atol=1e-5)
     assert np.all(shown_distance(computed, "search") <= shown_distance(computed, "mapper") + 1e-9)
-
-
-def random_poses(arm):
-    lower, upper = np.asarray(arm.joint_range).T
-    return np.random.default_rng(0).uniform(lower, upper, (POSES, len(lower)))
 
 
 def shown_distance(computed, key):

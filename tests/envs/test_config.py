@@ -9,10 +9,12 @@ from mimic.physics.world import WorldConfig
 
 def test_arms_and_world_choose_the_kind():
     assert mimic.env_config("panda4dof").kind == "one_arm"
-    assert mimic.env_config("panda4dof", world="paper").kind == "one_arm"
+    assert mimic.env_config("panda4dof", world="paper") == mimic.env_config("panda4dof")
     assert mimic.env_config("panda4dof", world="ideal").world == WorldConfig()
     assert mimic.env_config("panda4dof", world="ideal", control="joint_position").kind == "inner_loop"
     assert mimic.env_config("panda4dof", world={"payload": [0.0, 1.0]}).kind == "inner_loop"
+    assert mimic.env_config("panda4dof", world="hardware").kind == "inner_loop"
+    assert mimic.env_config("panda4dof", world="unknown").control == "torque"
     assert mimic.env_config("any_arm").kind == "sampled_arms"
 
 

@@ -185,8 +185,3 @@ def test_training_and_held_out_demonstrations_differ():
 def test_bad_overrides_are_rejected(overrides, message):
     with pytest.raises(ValueError, match=message):
         mimic.make("panda4dof", **overrides)
-
-
-def test_an_unknown_environment_lists_the_valid_ones():
-    with pytest.raises(ValueError, match="panda3dof, panda4dof, panda7dof, panda_family, planar4dof"):
-        mimic.make("panda5dof")

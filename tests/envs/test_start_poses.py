@@ -53,16 +53,6 @@ def test_each_episode_starts_at_rest_in_the_nearest_pose_of_its_demonstration(ev
 
 
 @pytest.mark.slow
-def test_an_equal_arm_starts_where_the_expert_does():
-    arm = mimic.panda()
-    qpos = np.random.default_rng(0).uniform(-1, 1, (3, arm.num_joints))
-    env = mimic.make("panda7dof", physics="fused", **SETTINGS)
-    poses = nearest_poses(arm, arm, qpos, env.metric.arguments)
-    states, expert = (mimic.link_states(arm, jnp.asarray(q, jnp.float32)) for q in (poses[0], qpos[0]))
-    assert float(env.states_distance(expert, states)) < 1e-3
-
-
-@pytest.mark.slow
 def test_holding_the_start_pose_and_videos_begin_there(evaluator):
     env = evaluator.env
     still = np.tile(env.start_poses[:, None], (1, 6, 1))

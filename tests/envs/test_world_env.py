@@ -9,7 +9,6 @@ import pytest
 
 import mimic
 from mimic.envs import imitation
-from mimic.envs.imitation import ImitationEnv
 from mimic.envs.make import make_env
 from mimic.envs.world_env import HardwareEnv, control_observation, expert_vector
 from mimic.evaluation.evaluator import Evaluator
@@ -55,13 +54,6 @@ def actions(nominal):
 @pytest.fixture(scope="module")
 def undelayed(nominal, actions):
     return roll(nominal, actions)
-
-
-def test_without_a_world_it_is_the_environment_of_the_paper():
-    assert type(mimic.make("panda4dof", demonstrations=FEW, world="paper")) is ImitationEnv
-    assert mimic.env_config("panda4dof", world="paper") == mimic.env_config("panda4dof")
-    assert mimic.env_config("panda4dof", world="hardware").kind == "inner_loop"
-    assert mimic.env_config("panda4dof", world="unknown").control == "torque"
 
 
 def test_a_delayed_action_acts_that_many_ticks_later(nominal, actions, undelayed):

@@ -46,17 +46,15 @@ def rollouts(evaluator, turned=(0.0, 0.0), faster=(0.0, 0.0), distance=None):
     return Rollouts(*(jnp.asarray(x, jnp.float32) for x in (qpos, qvel, 0 * qpos, distance)))
 
 
-def test_errors_are_zero_where_the_learner_moves_as_the_expert(evaluator):
-    """0.05 deg: the arc cosine of float32 near 1; velocities of some rad/s are rounded by 1e-6."""
-    table = evaluator.table(rollouts(evaluator))
-    assert np.all(table["link_angle_error_deg"] < 0.05)
-    assert np.all(table["angular_velocity_error"] < 1e-5)
-    assert not table["speed_violations"].any() and not table["torque_rms"].any()
-
-
-@pytest.mark.parametrize(("by", "links"), [((0.3, 0.0), (0.3, 0.3)), ((0.0, -0.3), (0, 0.3)), ((0.3, -0.3), (0.3, 0))])
+@pytest.mark.parametrize(
+    ("by", "links"),
+    [((0.0, 0.0), (0, 0)), ((0.3, 0.0), (0.3, 0.3)), ((0.0, -0.3), (0, 0.3)), ((0.3, -0.3), (0.3, 0))],
+)
 def test_errors_equal_a_known_rotation(evaluator, by, links):
-    """An angle or velocity of a joint moves all distal links. Tolerances as above."""
+    """An angle or velocity of a joint moves all distal links.
+
+    0.05 deg: the arc cosine of float32 near 1; velocities of some rad/s are rounded by 1e-6.
+    """
     turned = evaluator.table(rollouts(evaluator, turned=by))
     names = evaluator.env.learner.link_names
     for name, angle in zip(names, links, strict=True):

@@ -39,6 +39,12 @@ def states(arm, seed=0, dtype: DTypeLike = np.float32):
     return _link_states(arm, qpos.astype(dtype), qvel.astype(dtype))
 
 
+def random_poses(arm, count, seed=0):
+    """Poses [count, joints] within the limits of an arm."""
+    lower, upper = np.asarray(arm.joint_range).T
+    return np.random.default_rng(seed).uniform(lower, upper, (count, arm.num_joints)).astype(np.float32)
+
+
 def planar_optimum(expert, learner, qpos):
     """Closed form of the minimum distance of directions, by overlap: [...] for poses [..., joints] of a planar expert.
 

@@ -85,12 +85,11 @@ def mujoco_model(arm, draw: Draw) -> mujoco.MjModel:
     return model
 
 
-def simulate_in_mujoco(arm, plant, draw: Draw, mode: str, targets) -> np.ndarray:
-    """Angles after each tick, by C MuJoCo and the controller in NumPy."""
-    model, joints = mujoco_model(arm, draw), arm.embodiment.num_joints
-    constants = plant.constants
+def simulate_in_mujoco(model, home, plant, draw: Draw, mode: str, targets) -> np.ndarray:
+    """Angles after each tick of a model from its pose at home, by C MuJoCo and the controller in NumPy."""
+    joints, constants = model.nv, plant.constants
     data = mujoco.MjData(model)
-    data.qpos[:] = arm.embodiment.home
+    data.qpos[:] = home
     reference = Reference(data.qpos.copy(), np.zeros(joints), np.zeros(joints))
     limits = joint_control.reference_limits(constants.parameters)
     torque, rows = np.zeros(joints), []
@@ -134,7 +133,7 @@ def test_a_second_is_that_of_c_mujoco(arm_and_plant, mode):
     draw, targets = draw_for(arm.embodiment.num_joints), targets_for(arm, plant, mode, 20)
     if mode == "torque":  # without PD control it would fall into its stops
         draw = dataclasses.replace(draw, gravity_error=jnp.asarray(0.05))
-    expected = simulate_in_mujoco(arm, plant, draw, mode, targets)
+    expected = simulate_in_mujoco(mujoco_model(arm, draw), arm.embodiment.home, plant, draw, mode, targets)
     draw = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), draw)
     loop, state, rows = jax.jit(make_inner_loop(mode, plant.constants, PERIODS)), start_of(arm, np.float32), []
     episode = jax.jit(plant.episode)(draw)
@@ -150,7 +149,8 @@ def test_a_second_is_that_of_c_mujoco(arm_and_plant, mode):
 def test_in_double_precision_only_rounding_is_left(x64):
     arm, plant = make_arm_and_plant()
     draw, targets = draw_for(arm.embodiment.num_joints, 1), targets_for(arm, plant, "joint_position", 5)
-    expected = simulate_in_mujoco(arm, plant, draw, "joint_position", targets)
+    home = arm.embodiment.home
+    expected = simulate_in_mujoco(mujoco_model(arm, draw), home, plant, draw, "joint_position", targets)
     loop, state = jax.jit(make_inner_loop("joint_position", plant.constants, PERIODS)), start_of(arm, np.float64)
     episode = plant.episode(jax.tree.map(jnp.asarray, draw))
     for target in targets:

@@ -10,7 +10,6 @@ import pytest
 
 from mimic.arms.arm import build_arm
 from mimic.arms.capsules import fit_capsules
-from mimic.control import joint_control
 from mimic.control.joint_control import Reference
 from mimic.envs import env_config
 from mimic.envs.world_env import plant_of
@@ -18,29 +17,16 @@ from mimic.metric.capsule_distances import colliding_pairs
 from mimic.physics.inner_loop import LoopState
 from mimic.physics.mjx_loop import make_mjx_loop
 from mimic.physics.mujoco_world import mujoco_world
-from tests.physics.test_inner_loop import draw_for
+from tests.physics.test_inner_loop import PERIODS, draw_for, simulate_in_mujoco
 
-PERIODS, TICKS = 50, 12
+TICKS = 12
 
 
-def in_mujoco(model, plant, draw, home, target):
-    """Angles after each tick, and the largest number of contacts, by C MuJoCo and the controller in NumPy."""
-    joints, data = model.nv, mujoco.MjData(model)
-    constants = plant.constants
-    data.qpos[:] = home
-    zero = np.zeros(joints)
-    reference, torque, rows, contacts = Reference(np.asarray(home), zero, zero), zero, [], 0
-    for _ in range(TICKS):
-        for _ in range(PERIODS):
-            torque = joint_control.joint_torque(
-                "torque", data.qpos, data.qvel, reference, target, torque, constants.parameters, np
-            )
-            level = np.asarray(draw.friction) * plant.friction
-            data.qfrc_applied[:] = torque - level * np.tanh(constants.friction_rate * data.qvel)
-            mujoco.mj_step(model, data)
-            contacts = max(contacts, data.ncon)
-        rows.append(data.qpos.copy())
-    return np.stack(rows), contacts
+def contacts(model, qpos):
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    return data.ncon
 
 
 @pytest.fixture(scope="module")
@@ -82,8 +68,8 @@ def test_stops_and_contacts_are_those_of_c_mujoco(case, torque, touches):
     target = np.array(torque)
     model = world.model
     model.opt.gravity[:] = 0.0  # the draw has no error of the compensation
-    expected, contacts = in_mujoco(model, plant, draw, home, target)
-    assert (contacts > 0) == touches
+    expected = simulate_in_mujoco(model, home, plant, draw, "torque", [target] * TICKS)
+    assert any(contacts(model, qpos) for qpos in expected) == touches
     lower, upper = np.asarray(arm.embodiment.joint_range).T
     assert touches or np.any((expected[-1] > upper - 0.01) | (expected[-1] < lower + 0.01))
     zero = jnp.zeros(joints)

@@ -17,6 +17,7 @@ from mimic.trainers import run_training as session
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import make_model
 from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
+from tests.helpers.metric_cases import random_poses
 from tests.helpers.tiny import SHORT_ARMS
 
 SMALL = {"samples": 8192, "batch_size": 256, "epochs": 40, "evaluations": 2, "hidden_layers": [64, 64]}
@@ -45,11 +46,6 @@ def trained(tmp_path_factory):
     """A run of one second, of short arms."""
     run_dir = tmp_path_factory.mktemp("mapper") / "run"
     return run_dir, train(run_dir, arms=SHORT_ARMS, **SHORT)
-
-
-def poses(mapper, count, seed=0):
-    lower, upper = mapper.expert.joint_range.T
-    return np.random.default_rng(seed).uniform(lower, upper, (count, len(lower))).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +87,7 @@ def test_evaluate_repeats_the_report(trained, tmp_path):
 def test_a_loaded_mapper_takes_one_pose_or_many(trained):
     run_dir, report = trained
     mapper = mimic.PoseMapper.load(run_dir)
-    qpos = poses(mapper, 12)
+    qpos = random_poses(mapper.expert, 12)
     batch = mapper(qpos)
     assert batch.shape == (12, mapper.learner.num_joints) and np.all(np.abs(batch) <= np.pi + 1e-6)
     np.testing.assert_allclose(batch[3], mapper(qpos[3]), atol=1e-5)
@@ -105,7 +101,7 @@ def test_a_loaded_mapper_takes_one_pose_or_many(trained):
 
 def test_the_nearest_head_is_taken(trained):
     mapper = mimic.PoseMapper.load(trained[0])
-    qpos = jnp.asarray(poses(mapper, 5)[2])
+    qpos = jnp.asarray(random_poses(mapper.expert, 5)[2])
     candidates = jax.jit(mapper.candidates)(qpos)
     distances = jax.jit(jax.vmap(mapper.distance, (None, 0)))(qpos, candidates)
     np.testing.assert_allclose(jax.jit(mapper)(qpos), candidates[int(np.argmin(distances))], atol=1e-6)
@@ -157,7 +153,7 @@ def test_limited_joints_stay_within_their_limits():
     large = jax.tree.map(lambda x: 10 * x, model.init(jax.random.key(0)))  # most outputs near their ends
     mapper = mimic.PoseMapper(model, large)
     lower, upper = mapper.learner.joint_range.T
-    learner_poses = mapper(poses(mapper, 64))
+    learner_poses = mapper(random_poses(mapper.expert, 64))
     assert np.any(learner_poses < lower + 1e-3) and np.any(learner_poses > upper - 1e-3)
     assert np.all((learner_poses >= lower - 1e-5) & (learner_poses <= upper + 1e-5))
     with pytest.raises(ValueError, match="joint1 at 3.0000 rad is outside of its range"):

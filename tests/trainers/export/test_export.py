@@ -21,6 +21,7 @@ from mimic.trainers.pose_mapper.mapper import PoseMapper
 from mimic.trainers.pose_mapper.model import make_model
 from mimic.trainers.ppo.ppo import initial_params, make_controller, make_networks
 from mimic.trainers.run_config import save_config
+from tests.helpers.metric_cases import random_poses
 from tests.helpers.tiny import SHORT_ARMS
 
 pytest.importorskip("onnx")
@@ -62,11 +63,6 @@ def mapper_run(run_dir, name="panda4dof", preset="paper", **settings):
 
 def session_of(path):
     return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-
-
-def random_poses(arm, count, seed=0):
-    lower, upper = np.asarray(arm.joint_range).T
-    return np.random.default_rng(seed).uniform(lower, upper, (count, arm.num_joints)).astype(np.float32)
 
 
 @pytest.mark.parametrize("batch", [1, 33])
