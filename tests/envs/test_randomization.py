@@ -1,6 +1,5 @@
 """Randomised learners: factors of mass and damping, and noise on torques."""
 
-import copy
 import dataclasses
 import functools
 
@@ -15,6 +14,7 @@ from mimic.envs import imitation
 from mimic.envs.config import RandomizationConfig
 from mimic.envs.wrappers import wrap_for_training
 from mimic.physics.step import Load
+from tests.helpers.array_cases import loaded
 
 RANGES = {"mass": [0.5, 2.0], "damping": [1.0, 3.0]}
 ACTION = jnp.array([0.6, -0.4])
@@ -101,10 +101,7 @@ def test_a_heavier_arm_moves_as_in_mujoco(plain, physics):
     heavier = RandomizationConfig(mass=[1.2, 1.2], damping=[2.0, 2.0])
     config = dataclasses.replace(plain.config, physics=physics, randomization=heavier)
     env = mimic.ImitationEnv(config, plain.demonstrations)
-    model = copy.copy(env.arm.model)
-    model.body_mass *= 1.2
-    model.body_inertia *= 1.2
-    model.dof_damping *= 2.0
+    model = loaded(env.arm.model, 1.2, 2.0)
     model.opt.timestep = config.control_dt / config.substeps
     data = mujoco.MjData(model)
     data.qfrc_applied[:] = ACTION * env.torque_scale

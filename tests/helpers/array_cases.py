@@ -1,5 +1,6 @@
 """Random serial arms with random masses, their arrays, and their accelerations by C MuJoCo."""
 
+import copy
 from typing import Any
 
 import jax.numpy as jnp
@@ -60,6 +61,16 @@ def acceleration(model, qpos, qvel, torque):
     data.qpos[:], data.qvel[:], data.qfrc_applied[:] = qpos, qvel, torque
     mujoco.mj_forward(model, data)
     return data.qacc.copy()
+
+
+def loaded(model, mass, damping):
+    """A copy of a model with factors of all masses, inertias and dampings."""
+    heavier = copy.copy(model)
+    heavier.body_mass[:] *= mass
+    heavier.body_inertia[:] *= mass
+    heavier.dof_damping[:] *= damping
+    mujoco.mj_setConst(heavier, mujoco.MjData(heavier))
+    return heavier
 
 
 def looped(arm, qpos, qvel, torque, mass: Any = 1.0, damping: Any = 1.0, base: Any = None):

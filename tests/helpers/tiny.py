@@ -15,3 +15,4 @@ TINY = [
     "trainer.num_timesteps=5000",
     "trainer.evaluations=4",
 ]
+ENDLESS = ["trainer.num_timesteps=100000000", "trainer.evaluations=20000"]  # with many checkpoints

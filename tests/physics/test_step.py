@@ -13,7 +13,7 @@ from mimic.base import fused_kernel
 from mimic.physics import dynamics
 from mimic.physics.joint_numbers import joints_of_model
 from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
-from tests.helpers.array_cases import acceleration, assert_near
+from tests.helpers.array_cases import acceleration, assert_near, loaded
 from tests.helpers.lowering import gpu_program
 from tests.helpers.random_arms import SEEDS, random_arm
 from tests.helpers.trees import torso
@@ -62,15 +62,6 @@ def ours(function, model, *rows, mass=1.0, damping=1.0):
     """A function of `dynamics` on arrays [count, joints]; where a load is given, its torques are over the mass."""
     columns = ([jnp.asarray(column) for column in row.T] for row in rows)
     return np.stack(function(dynamics.loaded(joints_of_model(model), mass, damping), *columns), axis=-1)
-
-
-def loaded(model, load):
-    heavier = model.__copy__()
-    heavier.body_mass[:] *= load.mass
-    heavier.body_inertia[:] *= load.mass
-    heavier.dof_damping[:] *= load.damping
-    mujoco.mj_setConst(heavier, mujoco.MjData(heavier))
-    return heavier
 
 
 def original_and_simulated(name):
@@ -209,7 +200,7 @@ def test_locked_arms_accelerate_as_the_whole_arm_with_joints_held(x64, make, arg
 def test_both_physics_step_a_loaded_arm_as_mujoco_does(x64, kind):
     """Three steps of RK4 in double precision: the same formula, in another order."""
     model, timestep, substeps = build_arm(ARMS["planar"]).model, 0.01, 3
-    heavier = loaded(model, LOAD)
+    heavier = loaded(model, LOAD.mass, LOAD.damping)
     heavier.opt.timestep = timestep
     qpos, qvel, torque = random_states(model)
     advance = make_advance(model, timestep, substeps, kind)

@@ -12,6 +12,7 @@ import pytest
 
 from mimic.runs import signals
 from mimic.runs.signals import EXIT_HOOKS, Signals, exit_hook, is_repeat, noted_signals, runs_as_command
+from tests.helpers.commands import wait_for
 from tests.helpers.repository import REPOSITORY
 
 INT, TERM, USR2 = signal.SIGINT, signal.SIGTERM, signal.SIGUSR2
@@ -114,13 +115,6 @@ with noted_signals(signals):
 """
 
 
-def wait_for(path):
-    until = time.monotonic() + LATEST_S
-    while not path.exists():
-        assert time.monotonic() < until
-        time.sleep(0.05)
-
-
 def test_a_terminal_that_closes_leaves_what_there_is_to_keep(start, tmp_path):
     terminal, end = pty.openpty()
 
@@ -133,14 +127,14 @@ def test_a_terminal_that_closes_leaves_what_there_is_to_keep(start, tmp_path):
 
     process = start("-c", NOTED, stdin=end, stdout=end, stderr=end, preexec_fn=take_terminal)
     os.close(end)
-    wait_for(tmp_path / "ready")
+    wait_for(tmp_path, "ready", process)
     os.close(terminal)
     assert process.wait(LATEST_S) == 128 + signal.SIGHUP and (tmp_path / "kept").exists()
 
 
 def test_nohup_keeps_a_command(start, tmp_path):
     process = start("-c", NOTED, preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN))
-    wait_for(tmp_path / "ready")
+    wait_for(tmp_path, "ready", process)
     process.send_signal(signal.SIGHUP)
     process.send_signal(signal.SIGTERM)
     process.communicate(timeout=LATEST_S)

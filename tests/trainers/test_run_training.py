@@ -24,7 +24,7 @@ from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.run_config import load_config, new_run_dir
 from mimic.trainers.run_training import _memory_errors, prepare_training
 from tests.helpers.commands import command, run, start, wait_for
-from tests.helpers.tiny import TINY
+from tests.helpers.tiny import ENDLESS, TINY
 
 BY_SPLIT = {
     "optimality_gap", "mean_distance", "lower_bound", "hold_distance", "link_angle_error_deg", "angular_velocity_error",
@@ -280,9 +280,6 @@ def test_a_training_that_diverges_stops_and_keeps_its_checkpoints(finished, tmp_
     assert re.match(r"error: training diverged: \w+ is not finite after \d+ steps; the checkpoints before it", line)
     assert line.endswith(f" are kept in {run_dir}")
     assert checkpoint_steps(run_dir) == [0] and not (run_dir / "report.json").exists()
-
-
-ENDLESS = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"
 
 
 @pytest.mark.slow

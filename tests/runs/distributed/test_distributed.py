@@ -21,9 +21,7 @@ from mimic.runs.distributed.local_processes import LocalProcess, LocalProcesses,
 from mimic.runs.distributed.process_group import DistributedConfig, ProcessGroup
 from tests.helpers.commands import command, free_port, schemas, wait_for
 from tests.helpers.commands import start as start_command
-from tests.helpers.tiny import TINY
-
-LONG = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"  # with many checkpoints
+from tests.helpers.tiny import ENDLESS, TINY
 
 
 def start(tmp_path, *arguments, slurm=False):
@@ -112,7 +110,7 @@ def test_one_command_starts_all_processes_of_a_host(tmp_path):
 
 @pytest.mark.slow
 def test_ctrl_c_ends_all_that_one_command_started(tmp_path):
-    process = alone(tmp_path, "distributed.processes=2", "run_dir=run", *LONG)
+    process = alone(tmp_path, "distributed.processes=2", "run_dir=run", *ENDLESS)
     wait_for_checkpoint(tmp_path, [process])
     (other,) = started_by(process)
     process.send_signal(signal.SIGINT)
@@ -126,7 +124,7 @@ def test_ctrl_c_ends_all_that_one_command_started(tmp_path):
 @pytest.mark.parametrize("early", [False, True])
 def test_one_command_ends_if_a_process_of_it_is_lost(tmp_path, early):
     """Early: before they are connected."""
-    process = alone(tmp_path, "distributed.processes=2", "run_dir=run", *LONG)
+    process = alone(tmp_path, "distributed.processes=2", "run_dir=run", *ENDLESS)
     if not early:
         wait_for_checkpoint(tmp_path, [process])
     while not started_by(process):
@@ -148,7 +146,7 @@ def test_one_command_ends_if_a_process_of_it_is_lost(tmp_path, early):
     ],
 )
 def test_the_others_end_if_one_is_stopped_or_killed(tmp_path, number, lost, line):
-    processes = start(tmp_path, "run_dir=run", *LONG)
+    processes = start(tmp_path, "run_dir=run", *ENDLESS)
     wait_for_checkpoint(tmp_path, processes)
     os.kill(processes[lost].pid, number)
     other = processes[1 - lost]
@@ -232,7 +230,7 @@ def test_the_other_processes_end_with_the_first_where_it_is_good_enough(tmp_path
 
 @pytest.mark.slow
 def test_a_signal_to_one_process_stops_all_after_a_checkpoint(tmp_path):
-    processes = start(tmp_path, "run_dir=run", *LONG)
+    processes = start(tmp_path, "run_dir=run", *ENDLESS)
     wait_for_checkpoint(tmp_path, processes)
     processes[1].send_signal(signal.SIGTERM)
     (first, shown), (second, _) = finish(processes)

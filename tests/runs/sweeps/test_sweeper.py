@@ -22,7 +22,7 @@ from mimic.runs.sweeps.run_command import RunCommand
 from mimic.runs.sweeps.sweeper import Outcome, Sweeper, path_of
 from tests.helpers.commands import command, schemas, start, wait_for
 from tests.helpers.run_directories import write_run
-from tests.helpers.tiny import TINY
+from tests.helpers.tiny import ENDLESS, TINY
 
 # What Slurm would do, by the same commands: an array of jobs, each of which starts its step.
 SBATCH = """#!/bin/bash
@@ -172,9 +172,7 @@ def after_begin(folder, act):
     """Acts once the program has begun."""
 
     def wait():
-        until = time.monotonic() + 60
-        while not (folder / "began").exists() and time.monotonic() < until:
-            time.sleep(0.05)
+        wait_for(folder, "began")
         act()
 
     threading.Thread(target=wait).start()
@@ -302,8 +300,7 @@ def test_a_sweep_is_collected(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["basic", "submitit_local"])
 def test_ctrl_c_ends_a_sweep_at_the_next_checkpoint(launcher, tmp_path):
-    endless = ["trainer.num_timesteps=100000000", "trainer.evaluations=20000"]
-    arguments = ["-m", *SHORT, *endless, "seed=0,1", f"hydra/launcher={launcher}", "hydra.sweep.dir=sweep"]
+    arguments = ["-m", *SHORT, *ENDLESS, "seed=0,1", f"hydra/launcher={launcher}", "hydra.sweep.dir=sweep"]
     process = start("train", *arguments, cwd=tmp_path, start_new_session=True)
     wait_for(tmp_path, "sweep/0-*/checkpoints/0*[1-9]*", process)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
