@@ -7,7 +7,6 @@ import pytest
 from rich.console import Console
 
 import mimic
-from mimic.commands import cli
 from mimic.commands.capture import training_env
 from mimic.commands.collect.finished_runs import find_runs
 from mimic.commands.printed import train_command
@@ -37,13 +36,6 @@ def test_keys_of_arms_may_have_any_order(command):
     assert config.learner == mimic.ArmConfig(tip="hand", locked=[2])  # whatever arm the environment has, in any order
     prefix = PREFIXES[command]
     assert env_of(compose(command, f"{prefix}learner=panda", f"{prefix}learner.tip=hand")).learner.tip == "hand"
-
-
-def test_an_environment_without_arms_of_its_own_is_none():
-    with pytest.raises(
-        ValueError, match="learner: expected an arm, or an environment with arms of its own, got 'pair'"
-    ):
-        cli.expand_arguments(["learner=pair"], "view")
 
 
 ENVIRONMENTS = {

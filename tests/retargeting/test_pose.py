@@ -26,7 +26,6 @@ PAIRS = {
     "planar 7->4": (planar_arm([1 / 7] * 7), planar_arm([1 / 4] * 4)),
     "planar 4->7": (planar_arm([1 / 4] * 4), planar_arm([1 / 7] * 7)),
     "planar 3->2": (planar_arm([1 / 3] * 3), planar_arm([0.5, 0.5])),
-    "panda 7->7": (panda(), panda()),
     "panda 7->4": (panda(), panda(locked=(3, 6, 7))),
 }
 
@@ -76,25 +75,9 @@ def test_no_descent_of_the_distance_itself_gets_lower(name, weights, dtype):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "weights"), [("panda 7->4", (2.0, 1.0)), ("planar 7->4", (0.5, 1.0))])
-def test_the_closed_form_ends_no_higher_than_automatic_derivatives(name, weights):
-    """On the mean of 256 poses: single poses may end in another minimum, or higher by the smoothing.
-
-    Weights given as a function of the distances, even a constant one, have no closed form.
-    """
-    expert, learner = PAIRS[name]
-    qpos, matrix = poses(expert, 256), arc_length_correspondence(expert, learner)
-    closed = imitate_pose(expert, learner, qpos, matrix, DistanceWeights(*weights))
-    automatic = imitate_pose(expert, learner, qpos, matrix, lambda distances: DistanceWeights(*weights))
-    assert np.mean(closed.distance) <= np.mean(automatic.distance) + 1e-5  # float32, and a smoothing here and there
-    assert np.mean(closed.converged) >= np.mean(automatic.converged)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["panda 7->7", "panda 7->4"])
-def test_the_minimum_is_global(name):
+def test_the_minimum_is_global():
     """Against long descents from 512 random initial guesses: within 1e-3 for at least 99.5 % of the poses."""
-    expert, learner = PAIRS[name]
+    expert, learner = PAIRS["panda 7->4"]
     qpos, correspondence = poses(expert, 400, seed=1), overlap_correspondence(expert, learner)
     solution = imitate_pose(expert, learner, qpos, correspondence, DIRECTIONS)
     options = {"starts": 512, "iterations": 60, "key": jax.random.key(1)}
