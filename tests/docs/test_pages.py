@@ -9,6 +9,7 @@ from tests.helpers.pages import PAGES, REPOSITORY, Block, check, commands, modul
 
 DOCS = REPOSITORY / "docs"
 QUICK = ("install.md", "metric.md")  # run by `make test`; all by `make test-all`
+RUN = [page for page in PAGES if any(block.is_run and block.kind != "text" for block in read_blocks(page.read_text()))]
 
 
 def named(page):
@@ -64,7 +65,7 @@ def test_commands_and_code_are_valid(page, monkeypatch, tmp_path, own_registry):
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, marks=() if page.name in QUICK else pytest.mark.slow) for page in PAGES],
+    [pytest.param(page, marks=() if page.name in QUICK else pytest.mark.slow) for page in RUN],
     ids=named,
 )
 def test_pages_run(page, monkeypatch, tmp_path, own_registry):

@@ -6,13 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-import mimic
 from mimic.arms.embodiment import in_chain_lengths, load_mjcf, panda
 from mimic.metric.analytic_gradient import distance_and_gradient
 from mimic.metric.config import MetricConfig
 from mimic.metric.correspondence import arc_length_correspondence, overlap_correspondence
 from mimic.metric.kinematics import link_state_table, link_states
-from mimic.metric.motion_distance import motion_distance
 from mimic.metric.similarity import MEASURES, centre_line, centre_line_table, similarity
 from mimic.retargeting.costs import hand_cost
 from mimic.retargeting.pose_objective import pose_objective
@@ -103,23 +101,6 @@ def test_gradients_in_closed_form(x64, body, longer):
     above, below = np.split(np.asarray(distance)[:-1], 2)
     differences = (above - below) / (2 * step)
     np.testing.assert_allclose(gradient, differences, atol=1e-7 * np.abs(differences).max())
-
-
-@pytest.mark.slow  # 20 s to compile
-def test_distance_of_long_trees(x64, fingers):
-    """The loop over the joints against the definition, for more joints than are unrolled."""
-    motion, matrix = [*pose(fingers), *pose(fingers, 1)], np.asarray(arc_length_correspondence(fingers, fingers))
-    weights = mimic.DistanceWeights(1.0, 0.5, 0.1, 0.2)
-
-    def composed(*motion):
-        states = link_states(fingers, *motion[:2]), link_states(fingers, *motion[2:])
-        return mimic.embodiment_distance(*states, matrix, weights)
-
-    distance, indices = motion_distance(fingers, fingers, matrix, weights), tuple(range(4))
-    expected, actual = (jax.jit(jax.grad(f, indices))(*motion) for f in (composed, distance))
-    assert float(distance(*motion)) == pytest.approx(float(composed(*motion)))
-    for a, b in zip(expected, actual, strict=True):
-        np.testing.assert_allclose(b, a, atol=1e-9)
 
 
 @pytest.mark.slow

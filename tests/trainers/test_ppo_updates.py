@@ -85,11 +85,8 @@ def case(x64):
     return Case(config, unrolls, order, jax.random.split(jax.random.PRNGKey(2), DEVICES))
 
 
-@pytest.mark.slow_for("False-1")
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("staggered", "devices"), [(False, 1), pytest.param(True, 1, marks=pytest.mark.slow), (True, 2)]
-)
+@pytest.mark.parametrize(("staggered", "devices"), [(False, 1), (True, 2)])
 def test_updates_equal_those_of_each_minibatch_in_turn(case, staggered, devices):
     """With one device the compiled loop has one update an iteration, otherwise two."""
     on_all = jax.jit(jax.vmap(functools.partial(case.on_device, staggered, devices), axis_name="devices"))
