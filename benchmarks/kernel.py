@@ -1,12 +1,12 @@
 """The metric's kernel: from joint motions of two arms to their embodiment distance and its gradient.
 
-    python -m benchmarks.kernel [--out FILE] [--batches 1e2 ... 1e8] [--links 3 ... 64] [--methods mimic ...]
+    python -m benchmarks.kernel [--out FILE] [--batches 1e2 ... 1e8] [--methods mimic ...]
 
 All methods compute the embodiment distance of joint positions and velocities in the default metric; "gradient" also
 its gradient with respect to the learner's motion, "all" to that of both arms. Batches are of the Panda with 7 joints
-and the one with 4; links are those of two planar arms. `mimic` is `motion_distance` of the links, "mimic, with hands"
-that of the default metric, `composition` the parts of the first called separately. Limits of the device are the memory
-traffic of a copy, and the rate of fused multiply-adds.
+and the one with 4. `mimic` is `motion_distance` of the links, "mimic, with hands" that of the default metric,
+`composition` the parts of the first called separately. Limits of the device are the memory traffic of a copy, and the
+rate of fused multiply-adds.
 """
 
 import functools
@@ -24,7 +24,6 @@ from benchmarks.common.timing import time_program
 from mimic.metric.config import MetricConfig
 
 BATCHES = (1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8)
-LINKS = (3, 4, 7, 16, 32, 64)
 HAND = "mimic, with hands"
 METHODS = ("mimic", HAND, "composition")
 QUANTITIES = {"value": (), "gradient": (2, 3), "all": (0, 1, 2, 3)}  # arguments of the gradient
@@ -34,7 +33,7 @@ HANDS = mimic.HandWeights(METRIC.hand_rotation, METRIC.hand_position)
 LONGEST = 1.0  # s a call; the next case is about ten times as large
 CHECKED = 1000  # pairs that are compared with double precision
 COLUMNS = (
-    "sweep size:g method quantity pairs_per_s:.3g spread:.1% compile_s:.1f largest_error[value]:.1e "
+    "size:g method quantity pairs_per_s:.3g spread:.1% compile_s:.1f largest_error[value]:.1e "
     "largest_error[gradient]:.1e"
 )
 
@@ -45,11 +44,6 @@ class Arms:
     def __init__(self, expert: mimic.Embodiment, learner: mimic.Embodiment):
         self.expert, self.learner = expert, learner
         self.correspondence = np.asarray(METRIC.make_correspondence(expert, learner))
-
-
-def planar_pair(links: int) -> Arms:
-    rng = np.random.default_rng(links)
-    return Arms(*(mimic.planar_arm(rng.uniform(0.5, 1.5, links) / links) for _ in range(2)))
 
 
 def jax_function(method: str, arms: Arms, quantity: str) -> Callable[..., Any]:
@@ -98,11 +92,11 @@ def run(method: str, arms: Arms, batch: int, quantity: str) -> Row:
     return {**timing.summary(), "pairs_per_s": batch / timing.median, "largest_error": error}
 
 
-def sweep(name: str, cases: dict[int, tuple[Arms, int]], method: str) -> Iterator[Row]:
-    """A method on cases of increasing size; it ends with the first one that fails or takes too long."""
+def sweep(arms: Arms, batches: Sequence[int], method: str) -> Iterator[Row]:
+    """A method on batches of increasing size; it ends with the first one that fails or takes too long."""
     for quantity in QUANTITIES if method in ("mimic", HAND) else ("value", "gradient"):
-        for size, (arms, batch) in cases.items():
-            row: Row = {"sweep": name, "size": size, "batch": batch, "method": method, "quantity": quantity}
+        for batch in batches:
+            row: Row = {"size": batch, "method": method, "quantity": quantity}
             try:
                 row |= run(method, arms, batch, quantity)
             except Exception as error:  # the types for lack of memory differ by backend
@@ -121,16 +115,11 @@ def limits() -> dict[str, float]:
 
 
 def main() -> None:
-    on_gpu = jax.default_backend() == "gpu"
-    lists = {"batches": list(BATCHES if on_gpu else BATCHES[:5]), "links": [*LINKS], "methods": METHODS}
-    options = make_parser("kernel", __doc__, link_batch=1e6 if on_gpu else 1e3, **lists).parse_args()
-    panda = Arms(mimic.panda(), mimic.panda(locked=(3, 6, 7)))
-    sweeps = {
-        "batch": {int(batch): (panda, int(batch)) for batch in sorted(options.batches)},
-        "links": {links: (planar_pair(links), int(options.link_batch)) for links in sorted(options.links)},
-    }
+    lists = {"batches": list(BATCHES if jax.default_backend() == "gpu" else BATCHES[:5]), "methods": METHODS}
+    options = make_parser("kernel", __doc__, **lists).parse_args()
+    panda, batches = Arms(mimic.panda(), mimic.panda(locked=(3, 6, 7))), sorted(map(int, options.batches))
     methods = [method for method in METHODS if method in options.methods]
-    rows = (row for method in methods for name, cases in sweeps.items() for row in sweep(name, cases, method))
+    rows = (row for method in methods for row in sweep(panda, batches, method))
     device = limits()
     collect(options, rows, "results", COLUMNS, limits=device)
     print_table([device], "copy_bytes_per_second:.3g flops:.3g")

@@ -1,8 +1,6 @@
 """Similarity of robots to the arms of captured people: mimic's motions, and baselines, by measures nobody optimises.
 
-    python -m benchmarks.motion_capture CLIP.bvh ... --out FILE [--rate 20] [--arms FOLDER] [--trunks 0 0.25]
-
-With `--trunks`, only the effect of the trunk's length [m] is measured instead: nearest poses of the Panda to 64 poses.
+    python -m benchmarks.motion_capture CLIP.bvh ... --out FILE [--rate 20] [--arms FOLDER]
 
 Each arm of each clip is retargeted to the Panda, with and without locked joints, and to arms of an unpacked wheel of
 robosuite in FOLDER. Methods: `imitate_trajectory` with angles and positions of links that are cut alike, without and
@@ -42,7 +40,6 @@ from mimic.trainers.config import PoseMapperConfig
 from mimic.trainers.pose_mapper.model import MapperModel
 from mimic.trainers.pose_mapper.training import train
 
-_POSES = 64  # of a clip, for the effect of the trunk
 _SPEED = 15.0  # rad/s, of a joint: retargeting passes from one minimum to another within it
 # Angles, because they and positions are linear near a match, and cosines are not. See docs/motion_capture.md for the
 # weight of positions.
@@ -143,19 +140,6 @@ def measure(case: Case, methods: list[str]) -> list[Row]:
     return rows
 
 
-def nearest_with_trunk(clip: Path, side: str, trunk: float) -> Row:
-    """Similarity of the Panda's nearest poses to some of a clip's, with a trunk of a length [m]."""
-    part = max(read_arm(clip, side, CaptureConfig(trunk=trunk)).parts, key=lambda part: len(part.start))
-    with tempfile.TemporaryDirectory() as folder:
-        expert, qpos = _as_arm(part, Path(folder) / "person.xml", 1)
-    qpos, learner = qpos[:: len(qpos) // _POSES][:_POSES], mimic.panda()
-    metric = EnvConfig("trunk").metric.build(expert, learner)
-    nearest = mimic.imitate_pose(expert, learner, jnp.asarray(qpos, jnp.float32), **metric.arguments)
-    values = similarity(centre_line_table(expert, qpos), centre_line_table(learner, np.asarray(nearest.qpos, float)))
-    means = {name: float(np.mean(value)) for name, value in values.items()}
-    return {"clip": clip.name, "arm": side, "trunk_m": trunk, "distance": float(nearest.distance.mean()), **means}
-
-
 def _as_arm(part: LinkMotion, path: Path, every: int) -> tuple[mimic.Embodiment, np.ndarray]:
     """The person's arm, and its poses at one of so many samples."""
     zero = zero_frames(part)
@@ -174,17 +158,11 @@ def _measures(line: object, learner: mimic.Embodiment, qpos: np.ndarray, rate: f
 def main() -> None:
     parser = make_parser("motion_capture", __doc__, rate=20.0)
     parser.add_argument("clips", nargs="+", type=Path)
-    parser.add_argument("--trunks", nargs="+", type=float, metavar="M")
     parser.add_argument("--learners", nargs="+", metavar="NAME", help="some of the robots")
     parser.add_argument("--methods", nargs="+", metavar="NAME", choices=METHODS, default=list(METHODS))
     parser.add_argument("--arms", type=Path, help="folder with an unpacked wheel of robosuite")
     options = parser.parse_args()
     rows: list[Row] = []
-    if options.trunks:
-        rows = [nearest_with_trunk(clip, "right", trunk) for clip in options.clips for trunk in options.trunks]
-        write_results(options, results=rows)
-        print_table(rows, "clip trunk_m:.2f distance:.4f centre_line_distance:.4f tangent_angle_deg:.1f")
-        return
     robots = learners(options.arms)
     unknown = [name for name in options.learners or () if name not in robots]
     if unknown:
