@@ -260,8 +260,7 @@ class RecordingConfig:
       rate: samples per second of a table or of HDF5 files in `source`. Default None: stated there.
       arm: "left" or "right" arm of the person in a motion capture file `source`, or "both". Default "": right.
       capture: how such a file is read and cut.
-      out: .npz file of the demonstrations; must not exist.
-      plot: .png, .pdf or .svg file of the plot; must not exist. Default "": `out` with the suffix .png.
+      out: .npz file of the demonstrations, with the plot beside it as .png; neither may exist.
     """
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
@@ -277,7 +276,6 @@ class RecordingConfig:
     arm: str = ""
     capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
     out: str = ""
-    plot: str = ""
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -24,7 +24,6 @@ from mimic.motions.importing import import_demonstrations
 from mimic.retargeting.self_collision import smallest_clearances, touching_line
 from mimic.trainers.progress import is_animated
 
-_PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 _OF_SOURCE = "joints", "topic", "units", "rate"  # keys of a source of motions
 _NOT_RECORDED = "with source=FILE, whose motions are not recorded"
 
@@ -120,14 +119,11 @@ def _print_clearance(console: Console, env: EnvConfig, arm: Arm, demonstrations:
 
 
 def _files(config: RecordingConfig) -> tuple[Path, Path]:
-    """The new files of the demonstrations and of their plot."""
+    """The new files of the demonstrations and, beside it, of their plot."""
     out = new_file("out", config.out)
     if out.suffix != ".npz":
         raise ValueError(f"out: expected a file that ends in .npz, got {str(out)!r}")
-    plot = new_file("plot", config.plot or str(out.with_suffix(".png")))
-    if plot.suffix not in _PLOT_SUFFIXES:
-        raise ValueError(f"plot: expected a file that ends in {', '.join(_PLOT_SUFFIXES)}, got {str(plot)!r}")
-    return out, plot
+    return out, new_file("out", str(out.with_suffix(".png")))
 
 
 def _record(arm: Arm, env: EnvConfig, console: Console) -> tuple[Demonstrations, int]:

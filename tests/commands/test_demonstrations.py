@@ -31,7 +31,7 @@ def test_the_command_records_what_the_library_does(tmp_path):
     [
         (["out={taken}"], "exists; name a new file"),
         (["out=new.txt"], "expected a file that ends in .npz"),
-        (["out=new.npz", "plot=new.txt"], "expected a file that ends in .png, .pdf, .svg"),
+        (["out={folder}/drawn.npz"], "drawn.png' exists; name a new file"),
         (
             ["out=new.npz", "kind=dance"],
             "expected one of computed_torque, pid, reach, splines, steps, mixed, got 'dance'",
@@ -47,6 +47,7 @@ def test_the_command_records_what_the_library_does(tmp_path):
 def test_bad_input_of_the_command(reason, tmp_path, arguments, message):
     paths = {"taken": tmp_path / "taken.npz", "csv": tmp_path / "motions.csv", "folder": tmp_path}
     paths["taken"].write_text("")
+    (tmp_path / "drawn.png").write_text("")
     paths["csv"].write_text("time,joint1\n0,0\n")
     assert message in reason("demonstrations", *(argument.format(**paths) for argument in arguments))
 
