@@ -50,18 +50,6 @@ def test_steps_lead_to_an_equal_arm_and_its_velocity(x64, panda):
     np.testing.assert_allclose(found[6], qpos[6], rtol=0, atol=0.1)  # it moves only the last link, by a few cm
 
 
-@pytest.mark.slow
-def test_steps_reduce_the_distance_and_leave_locked_joints(x64, panda):
-    learner, matrix = lock_joints(panda, LOCKED), arc_length_correspondence(panda, panda)
-    metric, expert = Metric(matrix, WEIGHTS), link_states(panda, *motion(4))
-    pose, distances = jnp.zeros(MAX_JOINTS), []
-    for _ in range(8):
-        distances.append(float(metric(expert, link_states(learner, pose))))
-        pose, velocity, _ = nearest_pose(learner, WEIGHTS, matrix, expert, pose, 1)
-        assert not np.asarray(pose)[LOCKED > 0].any() and not np.asarray(velocity)[LOCKED > 0].any()
-    assert np.all(np.diff(distances) < 0)
-
-
 def test_poses_stay_within_ranges(x64, panda):
     qpos, qvel = motion(5)
     ranges = np.where(np.arange(MAX_JOINTS)[:, None] == 1, [[-0.1, 0.2]], panda.joint_range)
