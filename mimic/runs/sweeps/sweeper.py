@@ -8,7 +8,7 @@ import itertools
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,21 +60,13 @@ class PlannedRun:
 
 @dataclasses.dataclass
 class SweeperConf:
-    """The default sweeper.
-
-    Attributes:
-      params: overrides with several values, in addition to those of the command line.
-    """
+    """The default sweeper."""
 
     _target_: str = target("Sweeper")
-    params: dict[str, str] | None = None
 
 
 class Sweeper(hydra.plugins.sweeper.Sweeper):
     """Runs every combination of the values. If runs failed, it prints one line for each and exits with 1."""
-
-    def __init__(self, params: Mapping[str, str] | None = None):
-        self._params = [f"{key}={values}" for key, values in (params or {}).items()]
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """See Hydra's Sweeper."""
@@ -119,7 +111,7 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
         """
         assert self.config is not None and self.hydra_context is not None
         loader = self.hydra_context.config_loader
-        parsed = OverridesParser.create(config_loader=loader).parse_overrides([*self._params, *arguments])
+        parsed = OverridesParser.create(config_loader=loader).parse_overrides(arguments)
         _check_count(parsed)
         (combinations,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
         shared = set(combinations[0]).intersection(*combinations)
