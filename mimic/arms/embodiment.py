@@ -176,7 +176,6 @@ def load_mjcf(
     tip: Tip = None,
     hand: HandChoice = None,
     links: Links = "kept",
-    base_segment: bool = True,
 ) -> Embodiment:
     """Revolute joints of any MJCF or URDF, in a serial chain or a tree, with the ranges and limits of the model.
 
@@ -194,16 +193,15 @@ def load_mjcf(
         two arms on a torso, a hand with fingers. ["*"] stands for all ends of the model.
       hand: name of a site or body of the last link whose frame is the hand's (z: approach, x: opening), or a pose
         [x, y, z, qw, qx, qy, qz] in the last link's body; for several chains a list. Default: see `find_end`.
-      links: as for `panda`; of a tree always "kept".
-      base_segment: whether the segment from the base to the first joint is a link; without effect where links are
-        merged, because the paper has as many links as joints.
+      links: as for `panda`; of a tree always "kept". Merged ones have no segment from the base to the first joint,
+        because the paper has as many links as joints.
 
     Raises:
       ValueError: a file that is missing or not a model, no revolute joint, a branch, a loop, a name that the model
         lacks, or what `panda` rejects.
     """
     model = _model(path_or_model)
-    chain = read_chain(model, base, tip, hand, base_segment=base_segment and links == "kept")
+    chain = read_chain(model, base, tip, hand, base_segment=links == "kept")
     angles = resolve_locked(locked, tuple(joint.name for joint in chain.joints))
     return _locked_embodiment(chain, angles, _name(path_or_model, model), links)
 

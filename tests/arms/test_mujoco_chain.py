@@ -120,13 +120,12 @@ def test_a_base_segment_that_is_not_along_the_first_axis_does_not_move():
 @pytest.mark.parametrize(
     ("arm", "options", "names"),
     [
-        (on_a_base("0 0 0.3"), {"base_segment": False}, ("link1", "link2")),
         (on_a_base("0 0 0.3"), {"links": "merged"}, ("link1", "link2")),  # paper: as many links as joints
         (on_a_base("0 0 0"), {}, ("link1", "link2")),
         (model(revolute("a", pos="0 0 0.3", inner=TIP)), {}, ("link1",)),  # on the world, which is no part of an arm
         (model(revolute("a", pos="0 0 0.3", inner=TIP)), {"base": "world"}, ("base", "link1")),
     ],
-    ids=["switched off", "merged", "joint at the base", "world", "named world"],
+    ids=["merged", "joint at the base", "world", "named world"],
 )
 def test_arms_without_a_base_segment(arm, options, names):
     assert load_mjcf(arm, **options).link_names == names
