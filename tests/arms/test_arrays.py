@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, lock_joints, masked_arrays
+from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, masked_arrays
 from mimic.metric.kinematics import link_states
 from tests.helpers import random_arms
 from tests.helpers.array_cases import (
@@ -107,13 +107,6 @@ def test_planar_arms_have_no_offsets_but_their_lengths():
     np.testing.assert_array_equal(arrays.twist, np.tile([1.0, 0.0], (MAX_JOINTS, 1)))
     np.testing.assert_allclose(arrays.offset[:3], [[0, 0], [0.4, 0], [0.3, 0]], atol=1e-15)  # rounding
     np.testing.assert_allclose(arrays.second_moment[:, 3:], 0, atol=1e-15)
-
-
-def test_locking_keeps_the_joints_that_are_locked():
-    arm = arm_arrays(build_arm(ArmConfig()), free=[True] * 6 + [False])
-    locked = lock_joints(arm, np.arange(MAX_JOINTS) == 2)
-    assert locked.is_free.tolist() == [1, 1, 0, 1, 1, 1, 0, 0]
-    assert arm.is_free.tolist() == [1, 1, 1, 1, 1, 1, 0, 0]  # not changed in place
 
 
 def test_a_tree_is_rejected():

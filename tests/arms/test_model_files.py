@@ -97,13 +97,6 @@ def test_a_urdf_arm_moves_as_in_its_model(x64, tmp_path):
     assert arm.link_lengths[-1] == pytest.approx(0.15)
 
 
-def test_missing_meshes_of_a_urdf_are_ignored_with_a_message(tmp_path, caplog):
-    file = tmp_path / "arm.urdf"
-    file.write_text(original_model.urdf(mesh="package://four/meshes/l.stl"))
-    assert mimic.load_mjcf(file).num_joints == 4
-    assert "that cannot be read, the first package://four/meshes/l.stl" in caplog.text
-
-
 def test_servos_and_motors_give_the_same_arm(tmp_path):
     arms = []
     for actuators in ("motor", "position"):

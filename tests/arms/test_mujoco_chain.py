@@ -137,12 +137,6 @@ def test_links_that_the_model_marks_are_all_its_links():
     assert load_mjcf(marked, base="plate").link_names == ("link1",)
 
 
-def test_unnamed_joints_get_names():
-    arm = load_mjcf(model(revolute(inner=revolute(pos="1 0 0", inner=TIP))))
-    assert arm.joint_names == ("joint1", "joint2")
-    assert load_mjcf(model(revolute(inner=revolute(pos="1 0 0", inner=TIP))), locked=["joint2"]).num_joints == 1
-
-
 def test_links_of_length_zero_are_merged_with_a_message(caplog):
     wrist = revolute("c", axis="0 1 0", inner=TIP)  # same anchor as b
     chain._warn_merged.cache_clear()

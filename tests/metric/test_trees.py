@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mimic.arms.embodiment import in_chain_lengths, load_mjcf, panda
+from mimic.arms.embodiment import in_chain_lengths, load_mjcf
 from mimic.metric.analytic_gradient import distance_and_gradient
 from mimic.metric.config import MetricConfig
 from mimic.metric.correspondence import arc_length_correspondence, overlap_correspondence
@@ -81,11 +81,6 @@ def test_arc_length_is_the_mean_of_the_chains(body):
 def test_traced_lengths_give_the_same_correspondence(x64, body, longer):
     traced = jax.jit(arc_length_correspondence)(body, longer)
     np.testing.assert_allclose(traced, arc_length_correspondence(body, longer), rtol=1e-12)
-
-
-def test_chains_that_do_not_match(body):
-    with pytest.raises(ValueError, match="chains: expected as many chains"):
-        arc_length_correspondence(body, panda())
 
 
 def test_gradients_in_closed_form(x64, body, longer):

@@ -142,7 +142,6 @@ def mapped(tmp_path_factory):
         ([], "out: expected a file"),
         (["out=new.onnx", "run="], "run: expected the run directory to export"),
         (["out=new.onnx", "run=missing"], "'missing' is not a run directory"),
-        (["out=new.onnx", "checkpoint=6"], "has no checkpoint 6; it has 5"),
         ([f"out={__file__}"], "exists; name a new file"),
         (["out=no/new.onnx"], "there is no folder 'no'"),
         (["out=new.onnx", "format=tflite"], "expected one of onnx, controller, got 'tflite'"),
