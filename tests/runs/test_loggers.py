@@ -1,6 +1,5 @@
 """Metrics logged to Weights & Biases, which is replaced by a fake."""
 
-import csv
 import sys
 import types
 
@@ -9,6 +8,7 @@ import pytest
 import mimic
 from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
+from tests.helpers.run_directories import rows_of
 
 
 class FakeWandb(types.ModuleType):
@@ -40,8 +40,8 @@ def test_the_logger_gets_the_metrics_of_the_files_of_a_run(tmp_path, monkeypatch
     monkeypatch.delenv("WANDB_PROJECT", raising=False)
     monkeypatch.setitem(sys.modules, "wandb", wandb := FakeWandb())
     assert train.prepare_training(short_run(tmp_path / "run", "wandb"), 0.0)() == 0
-    with (tmp_path / "run" / "metrics.csv").open() as file:
-        rows = {int(row.pop("step")): {key: float(value) for key, value in row.items()} for row in csv.DictReader(file)}
+    written = rows_of(tmp_path / "run")
+    rows = {int(row.pop("step")): {key: float(value) for key, value in row.items()} for row in written}
     assert len(rows) == 2 and list((tmp_path / "run" / "tensorboard").iterdir())
     assert wandb.rows == rows and wandb.finished == 1
     (begun,) = wandb.begun

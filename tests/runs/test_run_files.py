@@ -14,6 +14,7 @@ import tensorboardX
 
 from mimic.runs.files import REPORT, write_report
 from mimic.runs.metrics_log import MetricsLog
+from tests.helpers.run_directories import rows_of
 
 
 def test_a_report_is_json_even_after_a_divergence(tmp_path):
@@ -30,8 +31,7 @@ def test_metrics_of_another_version_keep_their_columns(tmp_path):
     for step in (2, 3):
         log.write(step, {"new": 10.0 * step, "wall_time_s": 4.0})
     log.close()
-    with (tmp_path / "metrics.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path)
     assert rows[0] == {"step": "1", "old": "0.5", "wall_time_s": "2.0", "new": ""}
     assert rows[2] == {"step": "3", "old": "", "wall_time_s": "4.0", "new": "30.0"}
     assert {path.name for path in tmp_path.iterdir()} == {"metrics.csv", "tensorboard"}
@@ -43,11 +43,6 @@ def test_a_training_does_not_import_pytorch(tmp_path):
     code = "import sys, mimic.trainers.ppo.trainer as _; from mimic.runs.metrics_log import MetricsLog; "
     code += f"from pathlib import Path; MetricsLog(Path({str(tmp_path)!r})).close(); assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"PYTHONPATH": str(tmp_path)})
-
-
-def rows_of(run_dir):
-    with (run_dir / "metrics.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_a_resumed_log_is_cut_to_the_checkpoint(tmp_path):

@@ -1,7 +1,6 @@
 """`python -m mimic.train`: the run directory, evaluation, resuming and signals."""
 
 import contextlib
-import csv
 import dataclasses
 import json
 import logging
@@ -24,6 +23,7 @@ from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.run_config import load_config, new_run_dir
 from mimic.trainers.run_training import _memory_errors, prepare_training
 from tests.helpers.commands import command, run, start, wait_for
+from tests.helpers.run_directories import rows_of
 from tests.helpers.tiny import ENDLESS, TINY
 
 BY_SPLIT = {
@@ -34,11 +34,6 @@ BY_SPLIT = {
 REPORT_KEYS = {"env", "trainer", "seed", "wall_time_s", "env_steps", "steps_per_second", "hardware", "versions"}
 
 TIMES = {"wall_time_s", "training/sps", "training/walltime"}
-
-
-def rows_of(run_dir):
-    with (run_dir / "metrics.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def state_of(run_dir):
