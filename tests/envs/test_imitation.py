@@ -9,7 +9,7 @@ import pytest
 
 import mimic
 from mimic.envs.imitation import limit_excess, training_and_held_out
-from mimic.envs.wrappers import fresh_episodes
+from mimic.envs.wrappers import fresh_episodes, wrap_for_training
 from tests.helpers.tiny import SHORT_ARMS
 
 FEW = {"count": 6, "held_out": 2}
@@ -83,6 +83,34 @@ def test_reward_and_observation_follow_the_demonstration_step_by_step():
             assert np.abs(others - distances[i]).min() > 1e-4  # another sample would be noticed
         if i < 6:
             state = step(state, actions[i])
+
+
+def test_episodes_end_at_the_horizon_and_draw_new_demonstrations(planar_env):
+    env = wrap_for_training(planar_env, planar_env.config.horizon + 1)
+    count, horizon = 32, planar_env.config.horizon
+
+    @jax.jit
+    def rollout(state):
+        def step(state, _):
+            state = env.step(state, jnp.zeros((count, planar_env.action_size)))
+            arm = state.pipeline_state
+            return state, (state.done, state.info["truncation"], arm.demonstration, arm.step)
+
+        return jax.lax.scan(step, state, None, length=3 * horizon)[1]
+
+    state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), count))
+    assert len(np.unique(state.pipeline_state.step)) > 10  # the first episodes are out of step with each other
+    done, truncation, demonstration, step = map(np.asarray, rollout(state))
+    assert np.all(done.sum(axis=0) == 3)
+    assert not truncation.any()
+    assert np.all(step[done.astype(bool)] == 0)
+    assert all(len(np.unique(demonstration[:, i])) > 1 for i in range(count) if i % 8 == 0)
+
+
+def test_a_function_that_jax_has_stays(planar_env, monkeypatch):
+    monkeypatch.setattr(jax, "device_put_replicated", "of JAX", raising=False)
+    mimic.ImitationEnv(planar_env.config, planar_env.demonstrations)
+    assert jax.device_put_replicated == "of JAX"
 
 
 class JointsAndStep(mimic.ImitationEnv):
