@@ -43,12 +43,9 @@ def run(monkeypatch, run_dir, values, last=None):
     return step, float(jax.tree.leaves(params)[0][0]), evaluated
 
 
-def test_the_last_checkpoint_is_the_result(monkeypatch, tmp_path):
-    assert run(monkeypatch, tmp_path, [1.0, 2.0, 3.0]) == (2, 3.0, [0, 1, 2])
-
-
-def test_a_target_that_is_reached_ends_the_training_with_the_checkpoint_that_reached_it(monkeypatch, tmp_path):
-    assert run(monkeypatch, tmp_path, [1.0, 2.0, 3.0, 4.0], last=2) == (2, 3.0, [0, 1, 2])
+@pytest.mark.parametrize(("last", "result"), [(None, (3, 4.0, [0, 1, 2, 3])), (2, (2, 3.0, [0, 1, 2]))])
+def test_the_last_checkpoint_or_the_one_that_reached_the_target_is_the_result(monkeypatch, tmp_path, last, result):
+    assert run(monkeypatch, tmp_path, [1.0, 2.0, 3.0, 4.0], last) == result
 
 
 @pytest.mark.parametrize(("train", "held_out", "is_good"), [(0.1, 0.3, True), (0.2, 0.05, False)])
