@@ -12,6 +12,7 @@ from mimic.commands.collect.seed_groups import mean_interval
 from mimic.commands.config import CollectConfig
 from mimic.runs.sweeps.sweeper import SWEEP
 from mimic.trainers import run_config
+from mimic.trainers.presets import PPO_PRESETS
 from tests.helpers.run_directories import write_run
 
 PLOT = plot.plot_collected
@@ -131,7 +132,8 @@ def test_what_is_left_out_is_named_and_the_rest_is_kept(six, capsys):
     named = capsys.readouterr().err.splitlines()
     assert named == [f"left out: {run['name']}: {run['reason']}" for run in collected(six)["left_out"]]
     reasons = {run["name"]: run["reason"] for run in collected(six)["left_out"]}
-    assert "at 2,000 of 2,000,000 steps; continue with: python -m mimic.train resume=" in reasons["stopped"]
+    planned_steps = f"at 2,000 of {PPO_PRESETS['cpu']['num_timesteps']:,} steps"
+    assert f"{planned_steps}; continue with: python -m mimic.train resume=" in reasons["stopped"]
     assert "diverged" in reasons["diverged"] and "optimality_gap.train" in reasons["diverged"]
     assert "report.json cannot be read" in reasons["torn"]
     assert "of mimic 0.0.1, and this is" in reasons["of-old"] and "momentum" in reasons["of-old"]
