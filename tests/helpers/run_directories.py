@@ -44,13 +44,13 @@ def write_run(
     return run_dir
 
 
-@functools.cache
 def rows_of(run_dir: Path) -> list[dict[str, str]]:
     """The rows of a run's metrics."""
     with (run_dir / METRICS).open(newline="") as file:
         return list(csv.DictReader(file))
 
 
+@functools.cache
 def _config_text(env: str, trainer: str, settings: tuple[tuple[str, Any], ...]) -> str:
     """The config of a run; the config of an environment takes long to write."""
     resolved = PPOConfig(**dict(settings)).resolve("cpu") if trainer == "ppo" else PoseMapperConfig().resolve()
