@@ -1,9 +1,9 @@
 """Two Pandas imitate both arms of a captured person, without and with the cost of self-collision.
 
-    python -m benchmarks.bimanual CLIP.bvh --out FILE [--rate 10] [--poses FILE.npz]
+    python -m benchmarks.bimanual CLIP.bvh --out FILE [--rate 10]
 
 For `imitate_trajectory` at the captured speed: measures of similarity; the smallest distance of capsules of different
-arms, and of the same arm [m]; the fraction of samples in which any are closer than 2 cm; the largest speed of a joint.
+arms, and of the same arm [m]; the fraction of samples in which these are closer than 2 cm.
 """
 
 import tempfile
@@ -78,43 +78,29 @@ def capsule_distances(arm: mimic.Embodiment, capsules: mimic.Capsules, qpos: np.
 
 
 def measure(
-    expert: mimic.Embodiment,
-    learner: mimic.Embodiment,
-    capsules: mimic.Capsules,
-    poses: tuple[np.ndarray, np.ndarray],
-    rate: float,
+    expert: mimic.Embodiment, learner: mimic.Embodiment, capsules: mimic.Capsules, poses: tuple[np.ndarray, np.ndarray]
 ) -> Row:
     """Measures of a motion, from the poses of the expert and of the learner."""
     lines = centre_line_table(expert, poses[0]), centre_line_table(learner, np.asarray(poses[1], float))
     means = {name: float(np.mean(value)) for name, value in similarity(*lines).items()}
     closest = capsule_distances(learner, capsules, poses[1])
-    row: Row = {**means, "largest_speed": rate * float(np.abs(np.diff(poses[1], axis=0)).max())}
+    row: Row = dict(means)
     for name, distance in closest.items():
         row |= {f"{name}_minimum_m": float(distance.min()), f"{name}_closer": float(np.mean(distance < _CLOSE))}
-    return row | {"closer": float(np.mean(np.minimum(*closest.values()) < _CLOSE))}
+    return row
 
 
 def main() -> None:
     parser = make_parser("bimanual", __doc__, rate=10.0)
     parser.add_argument("clip", type=Path)
-    parser.add_argument(
-        "--poses", type=Path, metavar="FILE.npz", help="joint angles: those in it are read, others added"
-    )
     options = parser.parse_args()
     learner = EnvConfig("bimanual", learner=_PAIR, limits=_LIMITS).build_arms().learner.embodiment
     capsules = mimic.fit_capsules(_PAIR, _LIMITS)
     expert, qpos = read_both_arms(options.clip, learner, options.rate)
-    motions: dict[str, np.ndarray] = {}
-    if options.poses and options.poses.exists():
-        motions = dict(np.load(options.poses))
+    rows: list[Row] = []
     for name, costs in COSTS.items():
-        if name not in motions:
-            motions[name] = imitated(expert, learner, capsules, qpos, options.rate, costs)
-            if options.poses:
-                np.savez(options.poses, **motions)  # type: ignore[arg-type]
-    rows: list[Row] = [
-        {"cost": name, **measure(expert, learner, capsules, (qpos, motions[name]), options.rate)} for name in COSTS
-    ]
+        own = imitated(expert, learner, capsules, qpos, options.rate, costs)
+        rows.append({"cost": name, **measure(expert, learner, capsules, (qpos, own))})
     write_results(options, clip=options.clip.name, rate=options.rate, samples=len(qpos), results=rows)
     print_table(
         rows, "cost centre_line_distance:.4f tangent_angle_deg:.1f between_arms_minimum_m:.3f within_arm_minimum_m:.3f"

@@ -20,7 +20,6 @@ import optax
 import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
-from benchmarks.pose import planar
 from mimic.arms.arm import ArmConfig
 from mimic.arms.pose_limits import pose_limits
 from mimic.envs.config import EnvConfig
@@ -36,6 +35,11 @@ MINIMUM_SPEED = 1e-2  # rad/s
 MORE: dict[str, Any] = {"starts": 16, "iterations": 40, "seed": 1}
 COUNTS = "steps", "missed_absolute", "missed_relative"
 COLUMNS = "case steps missed_absolute missed_relative largest_excess:.1e mean_reference:.4f"
+
+
+def planar(links: int) -> ArmConfig:
+    """A planar arm of equal links, 1 m long."""
+    return ArmConfig(model="planar", link_lengths=[1 / links] * links)
 
 
 def _cases() -> dict[str, EnvConfig]:

@@ -10,12 +10,10 @@ it knows the reference only as late as a policy observes it. `edges` has each ra
 the other, and all together.
 """
 
-import argparse
 import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +25,8 @@ from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import load_config
 
 COLUMNS = (
-    "run seed fused:.2% mjx:.2% virtual:.2% tracking:.2% lead late:.2% late_lead tracking_virtual:.2% aborts contacts "
-    "edges_worst:.2% edges_together:.2% "
-    "centre_line:.4f centre_line_bound:.4f centre_line_hold:.4f"
+    "run seed fused:.2% mjx:.2% virtual:.2% tracking:.2% lead late:.2% late_lead aborts contacts edges_worst:.2% "
+    "edges_together:.2%"
 )
 
 
@@ -43,12 +40,7 @@ def measure(run: Path, episodes: int, edge_episodes: int) -> Row:
     (tracking, lead), (late, late_lead) = (
         run_tracking(trainer.evaluator, is_delayed=is_delayed) for is_delayed in (False, True)
     )
-    similarity = {
-        name: table["centre_line_distance"]["held_out"]
-        for name, table in trainer.evaluator.similarity_summary(fused, "policy").items()
-    }
     (whole,) = _virtual(run, episodes).values()
-    (tracked,) = _virtual(run, episodes, "controller=tracking").values()
     edges = _virtual(run, edge_episodes, "edges=true") if edge_episodes else {}
     single = {name: case["optimality_gap"] for name, case in edges.items() if not name.startswith("all")}
     together = [case["optimality_gap"] for name, case in edges.items() if name.startswith("all:")]
@@ -63,18 +55,10 @@ def measure(run: Path, episodes: int, edge_episodes: int) -> Row:
         "lead": lead,
         "late": trainer.metrics(late)["optimality_gap"]["held_out"],
         "late_lead": late_lead,
-        "tracking_virtual": tracked["optimality_gap"],
         "virtual": whole["optimality_gap"],
         "aborts": sum(whole["aborts"].values()),
         "contacts": whole["self_contacts"],
         **({"edges_worst": max(single.values()), "edges_together": max(together)} if edges else {}),
-        "centre_line": similarity["policy"],
-        "centre_line_bound": similarity["nearest_poses"],
-        "centre_line_hold": similarity["hold_home"],
-        "similarity": similarity,
-        "virtual_robot": whole,
-        "virtual_robot_tracking": tracked,
-        "edges": edges,
     }
 
 
@@ -87,12 +71,6 @@ def _virtual(run: Path, episodes: int, *options: str) -> dict[str, Any]:
         return json.loads((out / "report.json").read_text())["cases"]
 
 
-def rows(options: argparse.Namespace) -> Iterator[Row]:
-    """The rows of all runs."""
-    for run in options.runs:
-        yield measure(run, options.episodes, options.edge_episodes)
-
-
 def main() -> None:
     """Measures and prints."""
     parser = make_parser("hardware_world", __doc__)
@@ -100,7 +78,8 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--edge-episodes", type=int, default=200)
     options = parser.parse_args()
-    collect(options, rows(options), "runs", COLUMNS)
+    rows = (measure(run, options.episodes, options.edge_episodes) for run in options.runs)
+    collect(options, rows, "runs", COLUMNS)
 
 
 if __name__ == "__main__":

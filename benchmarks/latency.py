@@ -4,8 +4,8 @@
 
 The process is bound to one core of Linux, and XLA computes in the caller's thread, as a control loop would have it.
 `jit` is a caller inside `jax.jit`, `call` is `imitate_pose` itself, which also looks up what it compiled. Quantiles
-are medians over runs; `lowest_p99_us` is of the run that other processes disturbed least. The last row is a loop of
-Python alone, which is as long each time: what its p99 is above its p50 is the machine's.
+are medians over runs. The last row is a loop of Python alone, which is as long each time: what its p99 is above its p50
+is the machine's.
 """
 
 import functools
@@ -22,7 +22,7 @@ from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect
 from mimic.metric.config import MetricConfig
 
-COLUMNS = "start way p50_us:.0f p99_us:.0f lowest_p99_us:.0f"
+COLUMNS = "start way p50_us:.0f p99_us:.0f"
 STARTS = {"free": ("warm", "13 initial guesses"), "exact": ("warm", "36 initial guesses")}
 
 
@@ -72,13 +72,7 @@ def run_way(way: str, start: str, poses: int, runs: int, hand: str) -> Row:
 def row(start: str, way: str, times: np.ndarray) -> Row:
     """The quantiles of times [runs, poses]."""
     p50, p99 = 1e6 * np.quantile(times, [0.5, 0.99], axis=1)
-    return {
-        "start": start,
-        "way": way,
-        "p50_us": float(np.median(p50)),
-        "p99_us": float(np.median(p99)),
-        "lowest_p99_us": float(p99.min()),
-    }
+    return {"start": start, "way": way, "p50_us": float(np.median(p50)), "p99_us": float(np.median(p99))}
 
 
 def measure(poses: int, runs: int, hand: str) -> Iterator[Row]:

@@ -6,7 +6,7 @@ Each arm of each clip is retargeted to the Panda, with and without locked joints
 robosuite in FOLDER. Methods: `imitate_trajectory` with angles and positions of links that are cut alike, without and
 with the cost of the hand, and with the default metric; a pose mapper that was trained on the poses of the same arm of
 the clip, with the metric of the first; inverse kinematics of the scaled hand by mink, and of frames of the links as GMR
-does it; holding the home pose. Besides the measures of similarity: the largest speed of a joint between two samples
+does it. Besides the measures of similarity: the largest speed of a joint between two samples
 [rad/s], and the root mean square of the joints' jerk [rad/s^3], at the captured speed.
 """
 
@@ -34,7 +34,7 @@ from mimic.metric.similarity import centre_line_table, similarity
 from mimic.motions.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
 from mimic.motions.mocap.link_motion import TRUNK, LinkMotion
 from mimic.motions.mocap.points import SIDES
-from mimic.retargeting.pose_baselines import hand_ik, hold_home
+from mimic.retargeting.pose_baselines import hand_ik
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig
 from mimic.trainers.pose_mapper.model import MapperModel
@@ -89,8 +89,8 @@ def read_case(clip: Path, side: str, name: str, config: ArmConfig, rate: float) 
     return Case(expert, learner, qpos, marks, part.rate / every)
 
 
-def imitated(case: Case, metric: MetricConfig = METRIC, costs: mimic.Costs | None = None) -> np.ndarray:
-    arguments = metric.build(case.expert, case.learner).arguments
+def imitated(case: Case, costs: mimic.Costs | None = None) -> np.ndarray:
+    arguments = METRIC.build(case.expert, case.learner).arguments
     qpos, jump = jnp.asarray(case.qpos, jnp.float32), _SPEED / case.rate
     moved = mimic.imitate_trajectory(case.expert, case.learner, qpos, **arguments, largest_jump=jump, costs=costs)
     return np.asarray(moved.qpos)
@@ -122,11 +122,9 @@ def mapped(case: Case) -> np.ndarray:
 METHODS: dict[str, Callable[[Case], np.ndarray | None]] = {
     "mimic": lambda case: imitated(with_cut_links(case)),
     "mimic_hand": lambda case: imitated(with_cut_links(case), costs=HAND),
-    "mimic_default_metric": lambda case: imitated(case, MetricConfig()),
     "pose_mapper": lambda case: mapped(with_cut_links(case)),
     "hand_ik": lambda case: hand_ik(case.expert, case.learner, case.qpos, every=1),
     "frame_matching": lambda case: match_frames(case.expert, case.learner, case.qpos, case.marks),
-    "hold_home": lambda case: hold_home(case.expert, case.learner, case.qpos),
 }
 
 

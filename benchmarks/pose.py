@@ -1,4 +1,4 @@
-"""Pose imitation compared with other methods on the same poses: quality, and poses per second.
+"""Poses of a Panda with 4 joints by several methods from the same poses: quality, and poses per second.
 
     python -m benchmarks.pose --out FILE [--poses 1000] [--batch 1000] [--mink-poses 100]
 
@@ -19,7 +19,7 @@ import numpy as np
 
 import mimic
 from benchmarks.common.parser import make_parser
-from benchmarks.common.record import Row, collect, print_table
+from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.common.timing import time_call
 from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.metric.config import MetricConfig
@@ -31,20 +31,6 @@ MINK_STEPS, MINK_DT = 100, 0.1  # steps of inverse kinematics for a pose, and th
 COLUMNS = "method quality:.2% global_share:.2% distance:.4f poses_per_second:,.0f first_call_s:.1f"
 
 Solver = Callable[[np.ndarray], np.ndarray]  # expert's poses -> learner's poses
-
-
-def planar(links: int) -> ArmConfig:
-    """A planar arm of equal links, 1 m long."""
-    return ArmConfig(model="planar", link_lengths=[1 / links] * links)
-
-
-PAIRS = {
-    "planar 7->4": (planar(7), planar(4)),
-    "planar 4->7": (planar(4), planar(7)),
-    "panda 7->7": (ArmConfig(), ArmConfig()),
-    "panda 7->4": (ArmConfig(), ArmConfig(locked=[3, 6, 7])),
-    "panda 7->3": (ArmConfig(), ArmConfig(locked=[2, 3, 6, 7])),
-}
 
 
 def imitate(expert: Arm, learner: Arm, **options: Any) -> Solver:
@@ -81,8 +67,8 @@ def with_mink(expert: Arm, learner: Arm) -> Solver:
     return solve
 
 
-def run_pair(name: str, poses: int, batch: int, mink_poses: int) -> Row:
-    expert, learner = map(build_arm, PAIRS[name])
+def measure(poses: int, batch: int, mink_poses: int) -> Row:
+    expert, learner = build_arm(ArmConfig()), build_arm(ArmConfig(locked=[3, 6, 7]))
     metric = METRIC.build(expert.embodiment, learner.embodiment)
     joints = expert.embodiment.num_joints, learner.embodiment.num_joints
 
@@ -117,14 +103,14 @@ def run_pair(name: str, poses: int, batch: int, mink_poses: int) -> Row:
         is_global = values <= minimum * (1 + NEAR) + ROUNDING
         methods[method] |= {"poses": len(values), "distance": distance, "quality": quality}
         methods[method]["global_share"] = float(np.mean(is_global))
-    return {"pair": name, "best_distance": float(best.mean()), "random_distance": random, "methods": methods}
+    return {"pair": "panda 7->4", "best_distance": float(best.mean()), "random_distance": random, "methods": methods}
 
 
 def main() -> None:
-    options = make_parser("pose", __doc__, pair=PAIRS, poses=1000, batch=1000, mink_poses=100).parse_args()
-    rows = (run_pair(name, options.poses, options.batch, options.mink_poses) for name in options.pair)
-    for row in collect(options, rows, "results", "pair best_distance:.4f random_distance:.4f"):
-        print_table(({"method": name, **values} for name, values in row["methods"].items()), COLUMNS, row["pair"])
+    options = make_parser("pose", __doc__, poses=1000, batch=1000, mink_poses=100).parse_args()
+    row = measure(options.poses, options.batch, options.mink_poses)
+    write_results(options, results=[row])
+    print_table(({"method": name, **values} for name, values in row["methods"].items()), COLUMNS, row["pair"])
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ import jax
 import numpy as np
 
 from benchmarks.common.parser import make_parser
-from benchmarks.common.record import print_table
 from mimic.base.config import flatten, to_dict
 from mimic.base.files import read_json
 from mimic.envs import env_config
@@ -37,17 +36,12 @@ from mimic.trainers.pretrained.network import TRAINERS
 from mimic.trainers.run_config import load_config
 from mimic.trainers.trainer import Trainer
 
-COLUMNS = (
-    "network kB:.0f gap[train]:.2% gap[held_out]:.2% mean_distance[held_out]:.4f bound[held_out]:.4f "
-    "copying_distance[held_out]:.4f"
-)
-GAPS = {"policy": ("optimality_gap", "lower_bound"), "pose_mapper": ("quality", "optimal_distance")}
 MATRICES = {False: "float32", True: "float16"}
 _NOT_TRAINED = {"run_dir", "resume", "init", "compilation_cache", "env.name", "trainer.name"}
 
 
-def make_network(run_dir: Path, out: Path, commit: str, half: bool) -> dict[str, Any]:
-    """Writes the folder of a run's network, and returns its row of the table."""
+def make_network(run_dir: Path, out: Path, commit: str, half: bool) -> Path:
+    """Writes the folder of a run's network, and returns its path."""
     config = load_config(run_dir)
     kind = next(kind for kind, trainer in TRAINERS.items() if trainer == config.trainer.name)
     if config.env.kind == "sampled_arms":
@@ -66,13 +60,7 @@ def make_network(run_dir: Path, out: Path, commit: str, half: bool) -> dict[str,
     folder = out / f"{config.env.name}-{kind}"
     stored = rounded[:2] if kind == "policy" else rounded  # without the value network
     write_network(folder, config, stored, report, half=half)
-    return row(folder, kind, report)
-
-
-def row(folder: Path, kind: str, report: dict[str, Any]) -> dict[str, Any]:
-    gap, bound = GAPS[kind]
-    size = sum(path.stat().st_size for path in folder.iterdir()) / 1000
-    return {**report, "network": folder.name, "kB": size, "gap": report[gap], "bound": report[bound]}
+    return folder
 
 
 def training_command(config: TrainConfig) -> str:
@@ -120,13 +108,11 @@ def main() -> None:
     commit = options.commit or head
     if not commit:
         sys.exit("error: --commit: this is no git checkout; expected the commit that the runs were trained at")
-    rows = []
     for run_dir in options.runs:
         try:
-            rows.append(make_network(run_dir, options.out, commit, options.half))
+            print(f"results: {make_network(run_dir, options.out, commit, options.half)}")
         except ValueError as error:
             sys.exit(f"error: {error}")
-    print_table(rows, COLUMNS)
 
 
 if __name__ == "__main__":

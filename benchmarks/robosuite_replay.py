@@ -4,9 +4,9 @@
     PYTHON benchmarks/robosuite_replay.py replay JOBS OUT    # JSON files: a list of jobs, and of results
 
 A job has `task`, `robot`, `demonstration` (a folder of a recording), `base` [x, y, z, yaw] in the Panda's base frame,
-`motion` (a NumPy file of angles [time, joints]), and `frames` of pictures to write beside it. The objects start where
-the recording has them, and the arm at the first angles. robosuite's joint position control gets the angles of the next
-time, and its gripper the recorded command. A result has, beside success, `hand_lag_mm` and `door_rad` at each time.
+`motion` (a NumPy file of angles [time, joints]). The objects start where the recording has them, and the arm at the
+first angles. robosuite's joint position control gets the angles of the next time, and its gripper the recorded command.
+A result has, beside success, `hand_lag_mm` and `door_rad` at each time.
 """
 
 import functools
@@ -130,7 +130,7 @@ def replay(job: dict[str, Any], env: Any) -> dict[str, Any]:
     for robot in env.robots:
         robot.composite_controller.update_state()
         robot.composite_controller.reset()
-    joints, ever, error, pictures = qpos.shape[1], False, [], []
+    joints, ever, error = qpos.shape[1], False, []
     lag, door = [], []
     for time, action in enumerate(actions):
         goal = qpos[min(time + 1, len(qpos) - 1)]
@@ -140,14 +140,11 @@ def replay(job: dict[str, Any], env: Any) -> dict[str, Any]:
         lag.append(round(1e3 * hand_lag(env, goal), 2))
         if job["task"] == "door":
             door.append(round(float(env.sim.data._data.joint("Door_hinge").qpos[0]), 4))
-        if time in job.get("frames", ()):
-            pictures.append(picture(env, Path(job["motion"]).with_suffix(f".{time}.png")))
     return {
         "success": bool(env._check_success()),
         "ever": ever,
         "objects": objects_done(env),
         "tracking_error_rad": float(np.max(error)),
-        "pictures": pictures,
         "hand_lag_mm": lag,
         "door_rad": door,
     }
@@ -161,20 +158,6 @@ def hand_lag(env: Any, goal: np.ndarray) -> float:
     at_goal.qpos[: len(goal)] = goal
     mujoco.mj_kinematics(model, at_goal)
     return float(np.linalg.norm(at_goal.site(site).xpos - data.site(site).xpos))
-
-
-def picture(env: Any, path: Path) -> str:
-    """Writes a picture of the scene."""
-    from PIL import Image  # pyright: ignore[reportMissingImports]
-
-    with mujoco.Renderer(env.sim.model._model, 360, 480) as renderer:
-        camera = mujoco.MjvCamera()
-        camera.lookat, camera.distance, camera.azimuth, camera.elevation = [-0.15, 0, 0.95], 1.8, 130, -20
-        options = mujoco.MjvOption()
-        options.geomgroup[0] = 0
-        renderer.update_scene(env.sim.data._data, camera, options)
-        Image.fromarray(renderer.render()).save(path)
-    return str(path)
 
 
 def main() -> None:

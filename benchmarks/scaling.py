@@ -3,8 +3,7 @@
     python -m benchmarks.scaling --out FILE [--devices 1 2 4 8] [--processes one each] [--env panda4dof] [--seeds 0 1]
 
 Each device has as many arms, samples and steps as a run on one device has (weak scaling). A run is one process with all
-devices, or one process per device. Without GPUs, XLA divides the CPU into devices. The speed is the median between two
-evaluations.
+devices, or one process per device. The speed is the median between two evaluations.
 """
 
 import argparse
@@ -24,21 +23,18 @@ from benchmarks.common.timing import summary_of_rates
 from mimic.trainers.presets import PPO_PRESETS
 
 PROCESSES = ("one", "each")  # for all devices, or for each
-STEPS = {"gpu": 30_000_000, "cpu": 200_000}  # of one device
+STEPS = 30_000_000  # of one device
 _EVALUATIONS = 8
 _PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"
 COLUMNS = "devices processes steps_per_s:,.0f efficiency:.1% gap:.2% gap_deviation:.2% seeds"
 
 
-def environment(devices: int, processes: int, backend: str) -> dict[str, str]:
-    """Environment variables of a run: the GPUs that are visible to it, or the CPU devices of each process."""
+def environment(devices: int) -> dict[str, str]:
+    """Environment variables of a run: the GPUs that are visible to it."""
     inherited = {key: value for key, value in os.environ.items() if key != _PREALLOCATE}
-    if backend == "gpu":
-        visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
-        names = visible.split(",") if visible else [str(index) for index in range(devices)]
-        return {**inherited, "CUDA_VISIBLE_DEVICES": ",".join(names[:devices])}
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices // processes}"
-    return {**inherited, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags.strip()}
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    names = visible.split(",") if visible else [str(index) for index in range(devices)]
+    return {**inherited, "CUDA_VISIBLE_DEVICES": ",".join(names[:devices])}
 
 
 def measure(devices: int, processes: int, seed: int, common: Sequence[str], of_one: dict[str, int]) -> Row:
@@ -47,7 +43,7 @@ def measure(devices: int, processes: int, seed: int, common: Sequence[str], of_o
     training = [*common, *sizes, f"seed={seed}", *local]
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
-        result = train(run_dir, training, env=environment(devices, processes, jax.default_backend()))
+        result = train(run_dir, training, env=environment(devices))
         rates = [rate for (rate,) in read_metrics(run_dir, "training/sps")][1:]  # the first compiles
     row = {"devices": devices, "processes": processes, "seed": seed, **summary_of_rates(rates)}
     row |= {key: result["report"][key] for key in ("optimality_gap", "env_steps")}
@@ -80,14 +76,14 @@ def run(options: argparse.Namespace) -> Iterator[Row]:
 
 def main() -> None:
     os.environ[_PREALLOCATE] = "false"  # this process only lists the devices; their memory is for the runs
-    backend = "gpu" if jax.default_backend() == "gpu" else "cpu"
-    sizes = {"num_envs": PPO_PRESETS[backend]["num_envs"], "batch_size": PPO_PRESETS[backend]["batch_size"]}
+    sizes = {key: PPO_PRESETS["gpu"][key] for key in ("num_envs", "batch_size")}
     lists = {"devices": [1, 2, 4, 8], "processes": PROCESSES, "seeds": [0]}
-    parser = make_parser("scaling", __doc__, env="panda4dof", steps=STEPS[backend], **sizes, **lists)
+    parser = make_parser("scaling", __doc__, env="panda4dof", steps=STEPS, **sizes, **lists)
     parser.add_argument("--arguments", nargs="*", default=[], metavar="KEY=VALUE", help="further ones of mimic.train")
     options = parser.parse_args()
-    if backend == "gpu" and max(options.devices) > jax.device_count():
-        parser.error(f"--devices: this host has {jax.device_count()}, got {max(options.devices)}")
+    count = jax.device_count() if jax.default_backend() == "gpu" else 0
+    if max(options.devices) > count:
+        parser.error(f"--devices: this host has {count} GPUs, got {max(options.devices)}")
     runs = []
     for row in run(options):
         runs.append(row)  # a run that fails loses none of those before

@@ -35,9 +35,7 @@ TRANSLATIONS = 0.0, 0.25, 0.5, 1.0, 2.0, 4.0  # weights; that of rotation is 1
 SOME_TRANSLATIONS = 0.0, 0.5, 2.0
 KEPT = {("kept", name): TRANSLATIONS for name in ("arc_length", "overlap")}  # candidates
 MERGED = {("merged", name): SOME_TRANSLATIONS for name in ("overlap", "arc_length")}
-STATE_DEPENDENT = {("kept", name): SOME_TRANSLATIONS for name in ("hard", "soft")}
 HANDS = 0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.3  # weights of the hand's rotation
-SUBSET = ("panda -3,6,7", "panda -5")  # of state-dependent correspondence, which is slow
 EVERY = 10  # samples of a demonstration of which one is taken
 FULL, FULL_DEMONSTRATIONS = "panda -3,6,7", 40  # the environment panda4dof: on more demonstrations and samples
 ROBOSUITE = ("UR10e", "UR5e", "IIWA", "Kinova3", "Sawyer", "Jaco", "xArm7")
@@ -60,13 +58,11 @@ def other_arms(folder: Path) -> tuple[list[EnvConfig], list[str]]:
     return pairs, [name for name, file in files.items() if not file.is_file()]
 
 
-def expert_motions(config: ArmConfig, count: int, random: int) -> dict[str, Any]:
+def expert_motions(config: ArmConfig, count: int) -> dict[str, Any]:
     """Motions [count, time, n] of an expert by kind; instead of motions that cannot be recorded, the reason."""
     arm = build_arm(config)
-    lower, upper = np.asarray(arm.embodiment.joint_range).T
-    poses = np.random.default_rng(0).uniform(lower, upper, (random, 1, arm.embodiment.num_joints))
-    motions: dict[str, Any] = {"random": poses}
-    for kind in ("computed_torque", "reach"):
+    motions: dict[str, Any] = {}
+    for kind in similarity_front.DEMONSTRATIONS:
         try:
             motions[kind] = mimic.record_demonstrations(arm, count, kind=kind).qpos
         except ValueError as error:
@@ -113,11 +109,11 @@ def with_locked(whole: mimic.Embodiment, arm: mimic.Embodiment, qpos: np.ndarray
     return poses
 
 
-def run_pair(pair: EnvConfig, demonstrations: int, random: int, *, hands: bool = False) -> list[Row]:
+def run_pair(pair: EnvConfig, demonstrations: int, *, hands: bool = False) -> list[Row]:
     expert, learner = pair.build_arms().embodiments
     count, every = (max(FULL_DEMONSTRATIONS, demonstrations), 5) if pair.name == FULL else (demonstrations, EVERY)
     rows: list[Row] = []
-    motions = expert_motions(pair.expert, count, random)
+    motions = expert_motions(pair.expert, count)
     for kind in [kind for kind, motion in motions.items() if isinstance(motion, str)]:
         rows.append({"pair": pair.name, "set": kind, "failed": motions.pop(kind)})
     sets = {kind: motion[:, ::every].reshape(-1, expert.num_joints) for kind, motion in motions.items()}
@@ -128,7 +124,7 @@ def run_pair(pair: EnvConfig, demonstrations: int, random: int, *, hands: bool =
         values = similarity(lines[kind], centre_line_table(arm, qpos))
         if hands:
             values |= posture(expert, whole, None, sets[kind], with_locked(whole, arm, qpos))
-        means = {name: [round(float(x), 5) for x in (v.mean(), np.quantile(v, 0.9))] for name, v in values.items()}
+        means = {name: round(float(value.mean()), 5) for name, value in values.items()}
         rows.append({"pair": pair.name, "set": kind, "poses": len(qpos), "method": method, "measures": means})
 
     for (kind, motion), (baseline, function) in itertools.product(motions.items(), BASELINES.items()):
@@ -141,7 +137,7 @@ def run_pair(pair: EnvConfig, demonstrations: int, random: int, *, hands: bool =
             for kind, part in zip(sets, np.split(poses, ends[:-1]), strict=True):
                 add(method, kind, arm, part)
         return rows
-    candidates = KEPT | (MERGED if pair.learner.locked else {}) | (STATE_DEPENDENT if pair.name in SUBSET else {})
+    candidates = KEPT | (MERGED if pair.learner.locked else {})
     for (links, correspondence), translations in candidates.items():
         for method, arm, poses in optimal_poses(pair, links, correspondence, translations, everything):
             for kind, part in zip(sets, np.split(poses, ends[:-1]), strict=True):
@@ -150,7 +146,7 @@ def run_pair(pair: EnvConfig, demonstrations: int, random: int, *, hands: bool =
 
 
 def main() -> None:
-    parser = make_parser("similarity", __doc__, plot=Path, demonstrations=20, random=120, arms="robosuite")
+    parser = make_parser("similarity", __doc__, plot=Path, demonstrations=20, arms="robosuite")
     parser.add_argument("--pair", nargs="+", metavar="NAME", help="these pairs alone")
     parser.add_argument("--hands", action="store_true", help="weights of the hand's rotation in the default metric")
     options = parser.parse_args()
@@ -159,13 +155,14 @@ def main() -> None:
     pairs = {pair.name: pair for pair in (*locked_pandas(), *others)}
     if unknown := set(options.pair or ()) - set(pairs):
         parser.error(f"unknown pair {min(unknown)!r}; valid are {', '.join(pairs)}")
-    settings = {"demonstrations": options.demonstrations, "every": EVERY, "random": options.random}
+    settings = {"demonstrations": options.demonstrations, "every": EVERY}
     rows: list[Row] = []
     for name in options.pair or pairs:
-        rows += run_pair(pairs[name], options.demonstrations, options.random, hands=options.hands)
+        rows += run_pair(pairs[name], options.demonstrations, hands=options.hands)
         print(name, flush=True)
-        summary, lines = similarity_front.summarise(rows), similarity_front.to_lines(rows)
-        write_results(options, settings=settings, not_found=missing, summary=summary, rows=lines)
+        failed = [row for row in rows if "failed" in row]
+        summary = similarity_front.summarise(rows)
+        write_results(options, settings=settings, not_found=missing, summary=summary, failed=failed)
     similarity_front.print_tables(rows)
     if options.plot:
         (similarity_front.plot_hands if options.hands else similarity_front.plot)(rows, options.plot)

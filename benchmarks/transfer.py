@@ -248,10 +248,9 @@ def in_physics(options: argparse.Namespace, expert: Model, method: str, row: Row
     np.save(path, qpos)
     checked = check(learner, qpos, hands, float(np.median(np.diff(states[:, 0]))), SPEEDS[name])
     of_motion = {"exact": checked["exact"] / len(qpos), "speed": checked["speed"]}
-    frames = [len(qpos) // 2, len(qpos) - 1] if method == "mimic" else []
     job = {"task": task, "robot": name, "method": method, "base": row["base"], "motion": str(path)}
     files = [work / f"{kind}_{task}_{name}_{method}.json" for kind in ("jobs", "replays")]
-    files[0].write_text(json.dumps([{**job, "frames": frames, "demonstration": str(folder)}]))
+    files[0].write_text(json.dumps([{**job, "demonstration": str(folder)}]))
     script = Path(__file__).with_name("robosuite_replay.py")
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     subprocess.run([options.physics, str(script), "replay", *map(str, files)], check=True, env=environment)

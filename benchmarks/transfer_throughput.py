@@ -7,16 +7,13 @@ expert is the Panda of the package. The data set has the recordings of the five 
 enough frames, each with another angle of the first joint, so that no two episodes are the same.
 
 `command_s` is of `python -m mimic.retarget` from its start to its end with base=auto and an empty compilation cache, on
-the recordings alone, and `cpu_s` the seconds of processors that it takes. The base that it finds is then used for the
-whole data set in this process, with what the command compiled; reading, retargeting, certifying and writing are timed
-the second time: `frames_per_s`, and `frames_per_cpu_s` of processors. `candidates_per_s` are frames for which JAX alone
-finds postures.
+the recordings alone. The base that it finds is then used for the whole data set in this process, with what the command
+compiled; reading, retargeting, certifying and writing are timed the second time: `frames_per_s`.
 """
 
 import argparse
 import json
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -28,41 +25,30 @@ import numpy as np
 
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect
-from benchmarks.exact_hands import SPEEDS, as_numbers
+from benchmarks.exact_hands import as_numbers
 from benchmarks.transfer import TASKS, with_speeds
-from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.arm import ArmConfig
 from mimic.commands.config import RetargetConfig
 from mimic.commands.retarget import prepare_retargeting
 from mimic.envs.config import EnvConfig
-from mimic.metric.config import MetricConfig
-from mimic.retargeting.costs import NO_COSTS
-from mimic.retargeting.exact_candidates import candidates_of_motions
-from mimic.retargeting.exact_pose import SET
-from mimic.retargeting.hand_target import placement
-from mimic.retargeting.initial_guesses import random_poses
-from mimic.retargeting.pose import STARTS
 
-COLUMNS = (
-    "learner episodes frames exact:.1% ok:.1% seconds:.1f frames_per_s:,.0f frames_per_cpu_s:,.0f "
-    "candidates_per_s:,.0f command_frames command_s:.1f cpu_s:.1f"
-)
+COLUMNS = "learner episodes frames exact:.1% ok:.1% seconds:.1f frames_per_s:,.0f command_frames command_s:.1f"
 _TURN = 0.1  # rad, at most, by which the first joint of an episode is shifted
 _DT = 0.05  # s, of the recordings
 
 
-def write_episodes(path: Path, demonstrations: Path, frames: int) -> list[np.ndarray]:
-    """Writes a data set with at least as many frames; returns the angles of its episodes."""
-    random, motions = np.random.default_rng(0), []
+def write_episodes(path: Path, demonstrations: Path, frames: int) -> None:
+    """Writes a data set of each task's recording, and as many more of them as give so many frames."""
+    random, episodes, written = np.random.default_rng(0), 0, 0
     with h5py.File(path, "w") as file:
-        while sum(map(len, motions)) < frames:
-            with h5py.File(demonstrations / TASKS[len(motions) % len(TASKS)] / "demo.hdf5") as source:
+        while episodes < len(TASKS) or written < frames:
+            with h5py.File(demonstrations / TASKS[episodes % len(TASKS)] / "demo.hdf5") as source:
                 states = np.asarray(source["data/demo_1/states"], float)
             qpos = states[:, 1:8] + np.eye(7)[0] * random.uniform(-_TURN, _TURN)
-            motions.append(qpos)
-            group = file.create_group(f"data/demo_{len(motions)}")
+            episodes, written = episodes + 1, written + len(qpos)
+            group = file.create_group(f"data/demo_{episodes}")
             group["obs/robot0_joint_pos"], group["obs/robot0_gripper_qpos"] = qpos, states[:, 8:10]
             group["time"] = _DT * np.arange(len(qpos))
-    return motions
 
 
 def command(source: Path, learner: Path, out: Path, cache: Path) -> Row:
@@ -71,24 +57,23 @@ def command(source: Path, learner: Path, out: Path, cache: Path) -> Row:
         shutil.rmtree(folder, ignore_errors=True)
     arms = f"source={source}", "expert=panda", f"learner={learner}", f"out={out}"
     keys = "base=auto", "failing=kept", f"compilation_cache={cache}"
-    began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    began = time.perf_counter()
     subprocess.run([sys.executable, "-m", "mimic.retarget", *arms, *keys], check=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    seconds = time.perf_counter() - began
     report = json.loads((out / "report.json").read_text())
     frames = sum(episode["frames"] for episode in report["episodes"])
-    return {"base": report["base"], "command_frames": frames, "command_s": time.perf_counter() - began, "cpu_s": cpu}
+    return {"base": report["base"], "command_frames": frames, "command_s": seconds}
 
 
 def whole(source: Path, learner: Path, out: Path, cache: Path, base: list[float]) -> Row:
     """Reading, retargeting, certifying and writing in this process."""
     shutil.rmtree(out, ignore_errors=True)
     env = EnvConfig(expert=ArmConfig(model="panda"), learner=ArmConfig(model=str(learner)))
-    began, cpu = time.perf_counter(), time.process_time()
+    began = time.perf_counter()
     keys = RetargetConfig(str(source), env=env, out=str(out), base=base, failing="kept", compilation_cache=str(cache))
     work = prepare_retargeting(keys)
     assert work() == 0
-    seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
+    seconds = time.perf_counter() - began
     episodes = json.loads((out / "report.json").read_text())["episodes"]
     frames = sum(episode["frames"] for episode in episodes)
     return {
@@ -98,36 +83,18 @@ def whole(source: Path, learner: Path, out: Path, cache: Path, base: list[float]
         "ok": np.mean([episode["ok"] for episode in episodes]),
         "seconds": seconds,
         "frames_per_s": frames / seconds,
-        "frames_per_cpu_s": frames / cpu,
     }
-
-
-def candidates_per_s(name: str, learner: Path, motions: list[np.ndarray], base: list[float]) -> float:
-    """Frames a second for which JAX finds the postures of all branches."""
-    expert, arm = (build_arm(ArmConfig(model=model), "hardware").embodiment for model in ("panda", str(learner)))
-    arms = expert, arm, MetricConfig().build(expert, arm), NO_COSTS, None
-    poses, random = (
-        [qpos.astype(np.float32) for qpos in motions],
-        random_poses(arm, None, STARTS["exact"], np.float32, SET),
-    )
-    jump = (_DT * np.array(SPEEDS[name])).astype(np.float32)
-    began = time.perf_counter()
-    candidates_of_motions(arms, poses, placement(base), jump, random)
-    return sum(map(len, poses)) / (time.perf_counter() - began)
 
 
 def row(options: argparse.Namespace, name: str) -> Row:
     work, demonstrations = Path(options.work).absolute(), Path(options.demonstrations)
     learner, out, cache = with_speeds(options.folder, name).absolute(), work / f"out_{name}", work / f"cache_{name}"
-    recordings = write_episodes(work / "recordings.hdf5", demonstrations, 1)
-    while len(recordings) < len(TASKS):  # each once
-        recordings = write_episodes(work / "recordings.hdf5", demonstrations, sum(map(len, recordings)) + 1)
-    motions = write_episodes(work / "episodes.hdf5", demonstrations, options.frames)
+    write_episodes(work / "recordings.hdf5", demonstrations, 0)
+    write_episodes(work / "episodes.hdf5", demonstrations, options.frames)
     of_command = command(work / "recordings.hdf5", learner, out, cache)
     for _ in range(2):  # the first time compiles
         timed = whole(work / "episodes.hdf5", learner, out, cache, of_command["base"])
-    rate = [candidates_per_s(name, learner, motions, of_command["base"]) for _ in range(2)][1]
-    return as_numbers({"learner": name, **timed, "candidates_per_s": rate, "cores": os.cpu_count(), **of_command})
+    return as_numbers({"learner": name, **timed, "cores": os.cpu_count(), **of_command})
 
 
 def main(arguments: list[str] | None = None) -> None:

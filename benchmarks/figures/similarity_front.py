@@ -20,18 +20,6 @@ NO_HAND = "hand 0"  # the default metric without a weight of the hand
 DEMONSTRATIONS = "computed_torque", "reach"
 
 
-def to_lines(rows: Sequence[Row]) -> list[str]:
-    """Rows as lines of a table, a quarter of the size of JSON; a set that failed has the reason as its method."""
-    names = measure_names(rows)
-    columns = [f"{name}{suffix}" for name in names for suffix in ("", " q90")]
-    lines = [";".join(["pair", "set", "poses", "method", *columns])]
-    for row in rows:
-        values = [f"{value:g}" for name in names for value in row.get("measures", {}).get(name, ())]
-        words = [row["pair"], row["set"], str(row.get("poses", 0)), row.get("failed", row.get("method"))]
-        lines.append(";".join([*words, *values]))
-    return lines
-
-
 def measure_names(rows: Sequence[Row]) -> list[str]:
     """Names of the measures of some rows."""
     return list(next((row["measures"] for row in rows if "measures" in row), {}))
@@ -43,25 +31,21 @@ def is_lock(row: Row) -> bool:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """`compare` for the locks and for the other arms, on demonstrations and on random poses."""
-    summary = {}
-    for poses, sets in {"demonstrations": DEMONSTRATIONS, "random poses": ("random",)}.items():
-        others = [row for row in rows if " to " in row["pair"]]
-        summary[f"locks, {poses}, to copy_joints"] = compare([*filter(is_lock, rows)], "copy_joints", sets)
-        if any(row.get("method") == NO_HAND for row in rows):
-            summary[f"locks, {poses}, to no weight"] = compare([*filter(is_lock, rows)], NO_HAND, sets)
-            summary[f"other arms, {poses}, to no weight"] = compare(others, NO_HAND, sets)
-        summary[f"other arms, {poses}, to hand_ik"] = compare(others, "hand_ik", sets)
-    return summary
+    """`compare` for the locks and for the other arms."""
+    locks, others = [*filter(is_lock, rows)], [row for row in rows if " to " in row["pair"]]
+    summary = {"locks, demonstrations, to copy_joints": compare(locks, "copy_joints")}
+    if any(row.get("method") == NO_HAND for row in rows):
+        summary["locks, demonstrations, to no weight"] = compare(locks, NO_HAND)
+        summary["other arms, demonstrations, to no weight"] = compare(others, NO_HAND)
+    return {**summary, "other arms, demonstrations, to hand_ik": compare(others, "hand_ik")}
 
 
-def compare(rows: Sequence[Row], baseline: str, sets: Sequence[str]) -> dict[str, dict[str, Any]]:
+def compare(rows: Sequence[Row], baseline: str) -> dict[str, dict[str, Any]]:
     """By method run on all cases: ratio of each measure to a baseline's (geometric mean), cases lost, and cases."""
-    chosen = [row for row in rows if "failed" not in row and row["set"] in sets]
+    chosen = [row for row in rows if "failed" not in row]
     cases: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
     for row in chosen:
-        means = {name: mean for name, (mean, _) in row["measures"].items()}
-        cases.setdefault((row["pair"], row["set"]), {})[row["method"]] = means
+        cases.setdefault((row["pair"], row["set"]), {})[row["method"]] = row["measures"]
     result: dict[str, dict[str, Any]] = {}
     for method in dict.fromkeys(row["method"] for row in chosen):
         if all({method, baseline} <= set(case) for case in cases.values()):
@@ -97,7 +81,7 @@ def print_tables(rows: Sequence[Row]) -> None:
 
 def plot(rows: Sequence[Row], path: Path) -> None:
     """The candidates on the 28 locked Pandas relative to copying: the whole arm on the left, the hand on the right."""
-    compared = compare([*filter(is_lock, rows)], "copy_joints", DEMONSTRATIONS)
+    compared = compare([*filter(is_lock, rows)], "copy_joints")
     front = pareto_front(compared)
     families: dict[str, list[str]] = {}
     for method in compared:
@@ -129,7 +113,7 @@ def plot_hands(rows: Sequence[Row], path: Path) -> None:
         "Panda and other arms": [r for r in rows if " to " in r["pair"]],
     }
     for label, group in groups.items():
-        compared = compare(group, NO_HAND, DEMONSTRATIONS)
+        compared = compare(group, NO_HAND)
         points = {name: result for name, result in compared.items() if name.startswith("hand ")}
         values = [
             [result[name]["ratio"] for name in ("centre_line_distance", "hand_rotation_deg")]

@@ -15,7 +15,7 @@ def test_all_single_and_double_locks_and_two_more():
     pairs = benchmark.locked_pandas()
     assert len(pairs) == 7 + 21 + 2
     assert sum(summary.is_lock({"pair": pair.name}) for pair in pairs) == 28
-    assert {pair.name for pair in pairs} >= {*benchmark.SUBSET, benchmark.FULL}
+    assert {pair.name for pair in pairs} >= {benchmark.FULL}
 
 
 @pytest.mark.slow
@@ -32,7 +32,7 @@ def test_one_compiled_function_serves_all_weights():
 
 
 def row(pair, method, values, kind="computed_torque"):
-    measures = {name: [value, 2 * value] for name, value in zip(MEASURES, (*values, values[-1]), strict=True)}
+    measures = {name: value for name, value in zip(MEASURES, (*values, values[-1]), strict=True)}
     return {"pair": pair, "set": kind, "method": method, "measures": measures}
 
 
@@ -51,17 +51,8 @@ ROWS = [
 LOCKS = [row for row in ROWS if summary.is_lock(row)]
 
 
-def test_lines_have_all_that_rows_have():
-    rows = [{**ROWS[0], "poses": 3}, {"pair": "a to panda", "set": "computed_torque", "failed": "no goal"}]
-    names, measured, failed = (line.split(";") for line in summary.to_lines(rows))
-    line = dict(zip(names, measured, strict=True))
-    assert (line["pair"], line["poses"], line["method"]) == ("panda -1", "3", "copy_joints")
-    assert (line["frechet_distance"], line["frechet_distance q90"]) == ("0.2", "0.4")
-    assert failed == ["a to panda", "computed_torque", "0", "no goal"]
-
-
 def test_ratios_and_cases_lost():
-    compared = summary.compare(LOCKS, "copy_joints", ("computed_torque",))
+    compared = summary.compare(LOCKS, "copy_joints")
     assert list(compared) == ["copy_joints", "kept overlap 1", "kept overlap 2"]
     first, second = (compared[f"kept overlap {weight}"] for weight in (1, 2))
     assert first["cases"] == 2
