@@ -4,7 +4,7 @@ Nothing is changed or left out without a note.
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -16,6 +16,7 @@ FULL_TURN = 2 * np.pi - 1e-6  # rad: a range of a full rotation or more is that 
 _MAX_ANGLE = 4 * np.pi  # rad, of such a joint: beyond, the angles are no rad
 _MAX_TURNS = 2  # by which a joint is rotated into its range
 OVERSHOOT = 0.02  # rad, 1 degree: how far measured angles may lie beyond a joint's range
+_FAR_BEYOND = 0.1  # rad, more than zeros of real arms differ from those of their models
 # A jump is what a joint cannot do between two samples: a step of more than 0.15 rad (9 deg) that would need more than
 # 100 rad/s^2, several times what arms reach, or 3 rad/s more than before and after.
 _JUMP, _MAX_ACCELERATION, _MAX_SPEED = 0.15, 100.0, 3.0
@@ -200,6 +201,19 @@ def _in_range(
     if turns.any():
         notes.add("rotated by full turns into the joint range", f"{joint_names[int(np.argmax(turns != 0))]} of {name}")
     return motion._replace(qpos=qpos)
+
+
+def beyond_range(motions: Mapping[str, Motion], names: Sequence[str], ranges: np.ndarray) -> str:
+    """A line about the joint that is farthest beyond the arm's own range; empty where none is."""
+    low, high = (extreme([extreme(motion.qpos, axis=0) for motion in motions.values()], axis=0)
+                 for extreme in (np.min, np.max))  # fmt: skip
+    beyond = np.maximum(ranges[:, 0] - low, high - ranges[:, 1])
+    beyond[np.ptp(ranges, axis=1) >= FULL_TURN] = -np.inf  # joints that turn on
+    joint = int(np.argmax(beyond))
+    text = f"{names[joint]} is up to {beyond[joint]:.2g} rad beyond the range of the expert's model"
+    if beyond[joint] > _FAR_BEYOND:
+        return f"warning: {text}: another arm, other units, or the order, signs or zeros of joints?"
+    return text if beyond[joint] > OVERSHOOT else ""
 
 
 def _checked_velocities(name: str, motion: Motion, notes: Notes) -> Motion:

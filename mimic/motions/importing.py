@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.motions.cleaning import Notes, cleaned
+from mimic.motions.cleaning import Notes, beyond_range, cleaned
 from mimic.motions.demonstrations import RECORDED_SPEED, Demonstrations, check_effort
 from mimic.motions.formats.archives import read_archive
 from mimic.motions.formats.episodes import Motion, Recording
@@ -138,10 +138,12 @@ def read_recording(
         except ValueError as error:
             errors.append(error)
     if len(errors) > len(motions):
-        raise ValueError(f"{errors[0]}{'' if units or unit != 'rad' else '; degrees need units=deg'}")
+        is_in_rad = unit == "rad" and not units and "expected rad in" in str(errors[0])
+        raise ValueError(f"{errors[0]}{'; degrees need units=deg' * is_in_rad}")
     for error in errors:
         notes.add("left out", str(error).removeprefix("source: "))
-    lines = [_summary(motions), *recording.notes, *filter(None, [line]), *notes.lines()]
+    beyond = beyond_range(motions, arm.joint_names, model_range)
+    lines = [_summary(motions), *recording.notes, *filter(None, [line, beyond]), *notes.lines()]
     return recording._replace(motions=motions, notes=tuple(lines))
 
 
@@ -179,7 +181,7 @@ def read_source(source: Path, names: Sequence[str], topic: str, rate: float | No
         return read_rosbag2(source, names, topic)
     if is_hdf5(source):
         return read_hdf5(source, names, topic, rate)
-    if rate and not source.name.endswith(TABLES):
+    if rate and not source.name.lower().endswith(TABLES):
         raise ValueError(f"rate: expected only for tables and HDF5 files, got {rate:g} for {str(source)!r}")
     if topic:
         raise ValueError(
@@ -193,9 +195,9 @@ def read_source(source: Path, names: Sequence[str], topic: str, rate: float | No
         )
     if not source.is_file():
         raise ValueError(f"source: no file at {str(source)!r}")
-    if not source.name.endswith(SOURCES):
+    if not source.name.lower().endswith(SOURCES):
         raise ValueError(f"source: expected a file that ends in {', '.join(SOURCES)}, got {str(source)!r}")
-    return read_table(source, names, rate) if source.name.endswith(TABLES) else read_archive(source, names)
+    return read_table(source, names, rate) if source.name.lower().endswith(TABLES) else read_archive(source, names)
 
 
 def _window_starts(length: float, duration: float) -> np.ndarray:

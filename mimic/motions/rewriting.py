@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.motions.cleaning import FULL_TURN, OVERSHOOT, Notes, cleaned
+from mimic.motions.cleaning import Notes, beyond_range, cleaned
 from mimic.motions.demonstrations import Demonstrations, is_demonstrations, load_demonstrations
 from mimic.motions.doubts import doubts
 from mimic.motions.formats.episodes import Motion, Recording
@@ -21,8 +21,6 @@ from mimic.motions.formats.table_rewriting import rewrite_archive, rewrite_folde
 from mimic.motions.formats.tables import TABLES, is_folder_of_tables
 from mimic.motions.importing import read_source, source_names
 from mimic.motions.units import find_unit, from_rad, in_rad
-
-_FAR_BEYOND = 0.1  # rad, more than zeros of real arms differ from those of their models
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +105,7 @@ def read_data_set(
     stated = in_rad(recording, unit, ranges).motions  # with velocities that `cleaned` drops
     raw = {name: stated[name]._replace(qpos=motion.qpos) for name, motion in motions.items()}
     suspicious = [
-        _beyond(motions, arm.joint_names, ranges),
+        beyond_range(motions, arm.joint_names, ranges),
         *doubts(arm, raw, {name: every[name] for name in recording.commanded}, recording.joints),
     ]
     notes = tuple(filter(None, (*recording.notes, line, *suspicious)))
@@ -143,19 +141,6 @@ def _whole(recording: Recording, arm: Embodiment) -> tuple[dict[str, Motion], di
         else:
             faults[name] = "; ".join(notes.lines())
     return motions, faults
-
-
-def _beyond(motions: Mapping[str, Motion], names: Sequence[str], ranges: np.ndarray) -> str:
-    """A line about the joint that is farthest beyond the arm's own range; empty where none is."""
-    low, high = (extreme([extreme(motion.qpos, axis=0) for motion in motions.values()], axis=0)
-                 for extreme in (np.min, np.max))  # fmt: skip
-    beyond = np.maximum(ranges[:, 0] - low, high - ranges[:, 1])
-    beyond[np.ptp(ranges, axis=1) >= FULL_TURN] = -np.inf  # joints that turn on
-    joint = int(np.argmax(beyond))
-    text = f"{names[joint]} is up to {beyond[joint]:.2g} rad beyond the range of the expert's model"
-    if beyond[joint] > _FAR_BEYOND:
-        return f"warning: {text}: another arm, other units, or the order, signs or zeros of joints?"
-    return text if beyond[joint] > OVERSHOOT else ""
 
 
 def _near(command: Motion, motion: Motion) -> Motion:
@@ -241,6 +226,6 @@ def _writer(data: DataSet) -> Callable[[Path, Path, Replacement], list[str]] | N
         return rewrite_hdf5
     if is_folder_of_tables(path):
         return rewrite_folder_of_tables
-    if path.name.endswith(TABLES):
+    if path.name.lower().endswith(TABLES):
         return lambda source, out, replacement: rewrite_table(source, out, replacement, data.timed)
-    return rewrite_archive if path.suffix == ".npz" else None
+    return rewrite_archive if path.suffix.lower() == ".npz" else None

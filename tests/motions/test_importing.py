@@ -40,7 +40,7 @@ def archive(path, **changes):
         "joint_names": np.array(["root", *(f"joint{i}" for i in range(1, 8))]),
         "jnt_type": np.array([0, *[3] * 7]),
         "njnt": np.array(8),
-        "frequency": np.array(50.0),
+        "frequency": np.array([50.0]),
         "split_points": np.array([0, len(TIME), 2 * len(TIME)]),
         "metadata": np.array(None, object),  # pickled, which is not read
         **changes,
@@ -106,6 +106,23 @@ def test_locomujoco_files_are_split_and_their_free_joint_is_left_out(tmp_path):
     for which in range(2):
         np.testing.assert_allclose(imported.qpos[which], qpos, atol=1e-6)  # float32
         np.testing.assert_allclose(imported.qvel[which], qvel, atol=1e-5)
+
+
+def test_samples_that_are_no_numbers_are_left_out_of_an_archive(tmp_path):
+    qpos = np.tile(swing(TIME)[0], (2, 1))
+    qpos[100] = np.nan
+    names = np.array([f"joint{i}" for i in range(1, 8)])
+    source = archive(tmp_path / "loco.npz", qpos=qpos, qvel=None, joint_names=names, jnt_type=None)
+    source = source.rename(tmp_path / "LOCO.NPZ")
+    imported, notes = mimic.import_demonstrations(source, mimic.panda())
+    assert imported.count == 2 and any("without numbers left out: 1 of 300 in motion 0" in line for line in notes)
+
+
+def test_angles_beyond_the_range_of_the_model_are_a_warning(tmp_path):
+    """Such as degrees of a small motion, which limits=none takes."""
+    source, ranges = table(tmp_path / "swing.csv", names=NUMBERED), np.tile([-0.2, 0.2], (7, 1))
+    _, notes = mimic.import_demonstrations(source, mimic.panda(), joint_range=ranges)
+    assert any("rad beyond the range of the expert's model: another arm, other units" in line for line in notes)
 
 
 @pytest.mark.parametrize(("shape", "kind"), [((600, 6), "float64"), ((600, 3), "<U3")])

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.base.files import MAX_BYTES, open_file, read_text
+from mimic.motions.formats.names import UNSEEN
 
 
 class Cells(NamedTuple):
@@ -55,7 +56,10 @@ def read_cells(path: Path) -> Cells:
             if _are_numbers(header, separator) or len(header) != len(split_cells(lines[0], separator)):
                 header = []
             comments = comments[: len(comments) - bool(header)]
-        table = _numbers(rows, separator).reshape(len(rows), len(header) or -1)
+        table = _numbers(rows, separator)
+        if header and rows and table.shape[1] != len(header):
+            raise ValueError(f"its rows have {table.shape[1]} cells, its header {len(header)}")
+        table = table.reshape(len(rows), len(header) or -1)
         return Cells(comments, header, rows, separator, table)
     except (OSError, EOFError, ValueError, zlib.error) as error:
         reason = " ".join(str(error).split())[:200]
@@ -83,7 +87,7 @@ def _column(cells: Sequence[str], separator: str | None) -> np.ndarray:
     values = [_number(cell, separator) for cell in cells]
     numbers = np.array([math.nan if value is None else value for value in values])
     if words := [cell for cell, value in zip(cells, values, strict=True) if value is None]:
-        if len(words) + cells.count("") < len(cells):
+        if len(words) + sum(cell.lower() in UNSEEN for cell in cells) < len(cells):
             raise ValueError(f"expected a number, got {words[0]!r:.40}")
         try:
             dates = [datetime.fromisoformat(word) for word in words]
@@ -96,7 +100,7 @@ def _column(cells: Sequence[str], separator: str | None) -> np.ndarray:
 
 
 def _text(path: Path) -> str:
-    if path.suffix != ".gz":
+    if path.suffix.lower() != ".gz":
         return read_text(path)
     with open_file(path) as file, gzip.GzipFile(fileobj=file) as packed:
         content = packed.read(MAX_BYTES + 1)
@@ -111,9 +115,11 @@ def split_cells(line: str, separator: str | None) -> list[str]:
 
 
 def _number(cell: str, separator: str | None) -> float | None:
-    """The number in a cell, NaN in an empty one; None for a word."""
+    """The number in a cell, NaN in one that says that there is none; None for another word."""
+    if cell.lower() in UNSEEN:
+        return math.nan
     try:
-        return float((cell if separator == "," else cell.replace(",", ".")) or "nan")
+        return float(cell if separator == "," else cell.replace(",", "."))
     except ValueError:
         return None
 

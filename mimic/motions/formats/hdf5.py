@@ -14,7 +14,7 @@ from mimic.base.files import check_file, read_text
 from mimic.motions.formats.episodes import EXTRA, MAX_NUMBERS, Motion, Recording
 from mimic.motions.formats.hdf5_objects import JOINTS, object_poses
 from mimic.motions.formats.names import Selection, hand_position, parse_column, select
-from mimic.motions.formats.tables import TIMES, seconds
+from mimic.motions.formats.tables import is_time, seconds, unit_of_time
 
 SUFFIXES = (".hdf5", ".h5")
 _EPISODE = re.compile(r"(demo|traj|trajectory|episode|ep|rollout|run)_?\d+", re.IGNORECASE)
@@ -92,14 +92,14 @@ def read_hdf5(path: Path, joints: Sequence[str], entry: str = "", rate: float | 
 
 def episode_label(file: Path, name: str, files: int) -> str:
     """The name of the motion of an episode, of one of some files."""
-    return " ".join(filter(None, (file.stem if files > 1 else "", name)))
+    return " ".join(filter(None, (file.stem if files > 1 or not name else "", name)))
 
 
 def files_of(path: Path) -> list[Path]:
     """The HDF5 files that a path names: itself, or those in it."""
     if path.is_dir():
-        return sorted(file for file in path.iterdir() if file.suffix in SUFFIXES)
-    return [path] if path.suffix in SUFFIXES and path.is_file() else []
+        return sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+    return [path] if path.suffix.lower() in SUFFIXES and path.is_file() else []
 
 
 def episodes(file: Any) -> Iterator[tuple[str, Episode]]:
@@ -139,6 +139,12 @@ def _entries(episode: Episode, layout: _Layout | None) -> dict[str, list[str]]:
 
 def _motion(episode: Episode, layout: _Layout | None, selection: Selection, rate: float | None) -> Motion:
     """The motion of an episode."""
+    for entry in filter(None, (selection.entry, selection.gripper_entry)):
+        found = dict(_widths(episode)).get(entry, 0)
+        numbers = selection.joints if entry == selection.entry else selection.gripper
+        expected = 1 if entry == STATES and layout else max(map(int, numbers))
+        if found < expected:
+            raise ValueError(f"{episode.group.name} has {found} columns as {entry}, expected {expected} or more")
     samples = _columns(episode.sets[selection.entry])
     gripper = None
     if selection.entry == STATES and layout:
@@ -205,7 +211,7 @@ def _mappings(content: Any) -> Iterator[Mapping[str, Any]]:
 def _columns(item: Any) -> np.ndarray:
     if item.size > MAX_NUMBERS:
         raise ValueError(f"{item.name} has {item.size:,} numbers, expected at most {MAX_NUMBERS:,}")
-    return np.asarray(item[()], float).reshape(len(item), -1)
+    return np.asarray(item[()], float).reshape(len(item), item.shape[1] if item.ndim == 2 else 1)
 
 
 def velocities_entry(episode: Episode, entry: str) -> str:
@@ -221,8 +227,9 @@ def _times(episode: Episode, count: int, layout: _Layout | None, rate: float | N
         if len(states) == count and np.all(np.diff(states) > 0):
             return states
     for name, item in episode.sets.items() if rate is None else ():
-        if parse_column(name.split("/")[-1]).joint.lower() in TIMES and item.shape in ((count,), (count, 1)):
-            return seconds(item.name, _columns(item)[:, 0], "")[0]
+        column = parse_column(name.split("/")[-1])
+        if is_time(column) and item.shape in ((count,), (count, 1)):
+            return seconds(item.name, _columns(item)[:, 0], unit_of_time(column))[0]
     rates = [rate] if rate else [value for attributes in reversed(episode.attributes) for value in _rates(attributes)]
     if not rates:
         raise ValueError("it states no times: no data set time or timestamps; expected rate=, samples per second")

@@ -19,7 +19,7 @@ from mimic.motions.formats.episodes import (
     Recording,
 )
 from mimic.motions.formats.lerobot import DATA_FOLDER, EPISODES_FOLDER, FINAL, INFO
-from mimic.motions.formats.names import UNITS, hand_position, parse_column, select
+from mimic.motions.formats.names import UNITS, common_unit, hand_position, parse_column, select
 
 _TIME_TOLERANCE = 1e-4  # s: LeRobot's own, between a timestamp and that of its frame
 _FLOATS = ("float32", "float64")
@@ -33,10 +33,10 @@ def is_lerobot(path: Path) -> bool:
 
 
 class _Feature(NamedTuple):
-    """A feature that is a vector of numbers: its columns by joint, for angles and for velocities, and its unit."""
+    """A feature that is a vector of numbers: columns by joint, for angles and for velocities, and units of angles."""
 
     columns: dict[Quantity, dict[str, int]]
-    unit: str
+    units: dict[str, str]
 
 
 def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> Recording:
@@ -69,6 +69,7 @@ def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> Record
     order = np.lexsort((frame, episode))
     present, starts = np.unique(episode[order], return_index=True)
     final = _final_values(path, selection.entry)
+    unit = common_unit(str(path), {joint: chosen.units[joint] for joint in selection.joints})
     motions, notes = {}, list(selection.notes)
     for number, rows in zip(present, np.split(order, starts[1:]), strict=True):
         times, line = _times(frame[rows], time[rows], fps)
@@ -85,7 +86,7 @@ def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> Record
         motions[f"episode {number}"] = Motion(times, qpos, qvel, opening, hand)
     notes += _lacking(path, info, len(motions), len(episode))
     robot = str(info.get("robot_type") or "")
-    return Recording(motions, unit=chosen.unit, robot=robot, notes=tuple(notes), **selection.facts)
+    return Recording(motions, unit=unit, robot=robot, notes=tuple(notes), **selection.facts)
 
 
 def _lacking(path: Path, info: Mapping[str, Any], episodes: int, frames: int) -> list[str]:
@@ -130,12 +131,16 @@ def _features(features: Mapping[str, Any]) -> dict[str, _Feature]:
         if form.get("dtype") not in _FLOATS or size != [len(names)] or str(feature).startswith(_NO_JOINTS):
             continue
         columns: dict[Quantity, dict[str, int]] = {ANGLE: {}, VELOCITY: {}}
-        units = [UNITS.get(str(unit).lower(), "") for unit in form.get("units") or ()]
+        stated = [str(unit).lower() for unit in form.get("units") or ()]
+        units: dict[str, str] = {}
         for index, name in enumerate(names):
             column = parse_column(name)
-            units.append(column.unit)
-            columns.setdefault(column.quantity, {})[column.joint.removeprefix(EXPERT)] = index
-        entries[str(feature)] = _Feature(columns, next(filter(None, units), ""))
+            joint = column.joint.removeprefix(EXPERT)
+            columns.setdefault(column.quantity, {})[joint] = index
+            if column.quantity == ANGLE:
+                own = stated[index] if len(stated) == len(names) else ""
+                units[joint] = column.unit or UNITS.get(own, own)
+        entries[str(feature)] = _Feature(columns, units)
     return entries
 
 

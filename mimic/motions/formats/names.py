@@ -18,12 +18,14 @@ UNITS = {
     **dict.fromkeys(("deg", "degree", "degrees", "deg/s", "°", "°/s"), "deg"),
     **dict.fromkeys(("percent", "%"), "percent"),
 }
+UNSEEN = {"", "-", "--", "null", "none", "na", "n/a", "missing"}  # cells without a number, in lower case
 SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _BRACKETS = re.compile(r"(.+?)\s*[\[(](.+?)[\])]")
 _LAST, _FIRST = re.compile(r"(.+)[./_ ]([^./_ ]+)"), re.compile(r"([a-z]+)[./_ ]?(.+)", re.IGNORECASE)
 _LEAF = re.compile(r"(|.*[./])([^./]+)")
 _NUMBERED = re.compile(r"([a-z]+)[./_ ]([a-z]+)[./_ ]?(\d+)", re.IGNORECASE)
-_WHOSE = "actual", "measured", "target", "desired", "commanded", "command", "joint", "robot"  # before a quantity's word
+# Before a quantity's word.
+_WHOSE = "actual", "measured", "target", "desired", "commanded", "command", "joint", "robot", "state", "field"
 _COUNTED = re.compile(rf"((?:{'|'.join(_WHOSE)}|motor|servo|axis|dof|[ajq])*)(\d+)")
 _BY_ORDER = "by their order"
 _GRIPPER = re.compile(r"gripper|finger|jaw|knuckle", re.IGNORECASE)
@@ -77,11 +79,11 @@ class Selection(NamedTuple):
 
 
 def parse_column(text: str) -> Column:
-    """Splits a column's name: `joint1.pos`, `qdot_joint1`, `q1`, `actual_q_0`, `elbow [deg]`, `/arm/elbow/velocity`."""
+    """Splits a column's name: `joint1.pos`, `qdot_joint1`, `q[0]`, `actual_q_0`, `elbow [deg]`, `/arm/elbow/speed`."""
     name, unit = text.strip(), ""
     if match := _BRACKETS.fullmatch(name):
-        name, stated = match[1], match[2].strip().lower()
-        unit = UNITS.get(stated, stated)
+        stated = match[2].strip().lower().rstrip(".")
+        name, unit = (f"{match[1]}_{stated}", "") if stated.isdigit() else (match[1], UNITS.get(stated, stated))
     if not unit and (match := _LAST.fullmatch(name)) and match[2].lower() in UNITS:
         name, unit = match[1], UNITS[match[2].lower()]
     if (match := _LAST.fullmatch(name)) and match[2].lower() in QUANTITIES and match[2].lower() not in _NEVER_AFTER:
@@ -91,6 +93,19 @@ def parse_column(text: str) -> Column:
     if (match := _NUMBERED.fullmatch(name)) and match[1].lower() in _WHOSE and match[2].lower() in QUANTITIES:
         return Column(f"{match[1]} {match[3]}", QUANTITIES[match[2].lower()], unit)
     return Column(name, ANGLE, unit)
+
+
+def common_unit(path: str, units: Mapping[str, str]) -> str:
+    """The unit of the angles of joints, from those that their columns state; empty where none does.
+
+    Raises:
+      ValueError: several units, or one that is not known.
+    """
+    stated = {unit: joint for joint, unit in units.items() if unit}
+    if len(stated) > 1 or set(stated) - set(UNITS.values()):
+        found = ", ".join(f"{joint} in {unit!r:.40}" for unit, joint in stated.items())
+        raise ValueError(f"source: {path!r} has {found}; expected all angles in rad, in deg, or in percent")
+    return next(iter(stated), "")
 
 
 def find_joints(present: Sequence[str], joints: Sequence[str]) -> tuple[list[str], str] | None:
@@ -108,6 +123,7 @@ def find_joints(present: Sequence[str], joints: Sequence[str]) -> tuple[list[str
     keys = [_key(joint) for joint in joints]
     prefixes = [key.removesuffix(keys[0]) for key in by_key if key.endswith(keys[0])]
     fitting = [prefix for prefix in prefixes if all(prefix + key in by_key for key in keys)]
+    fitting = [prefix for prefix in fitting if not is_command(prefix)] or fitting
     if "" in fitting or len(fitting) == 1:
         prefix = "" if "" in fitting else fitting[0]
         return [by_key[prefix + key] for key in keys], "by name"
@@ -186,9 +202,11 @@ def select(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str
     ((name, (columns, rule)),) = found.items()
     if is_command(name) and not entry:
         notes.append(f"{name}: what was commanded, since only it has the joints")
-    if rule:
-        notes.append(f"joints: {', '.join(columns)}, found {rule}; joints=[...] names others")
     gripper, gripper_entry = _gripper(entries, name, columns)
+    if rule:
+        others = len(entries[name]) - len(columns) - len(gripper if gripper_entry == name else ())
+        among = f" among {len(entries[name])}" if rule == _BY_ORDER and others else ""
+        notes.append(f"joints: {', '.join(columns)}, found {rule}{among}; joints=[...] names others")
     if gripper and gripper_entry == name and all(column.isdigit() for column in gripper):
         notes.append(f"gripper: {', '.join(gripper)}, after the joints")
     commanded = [] if entry else [other for other in considered if other != name and is_command(other)]
@@ -222,7 +240,7 @@ def hand_position(entries: Mapping[str, Sequence[str]]) -> tuple[str, list[str]]
 
 def is_command(entry: str) -> bool:
     """Whether an entry's name says that it is what was commanded, and not what was measured."""
-    return bool(re.search(r"action|command|target|desired|master|leader", entry, re.IGNORECASE))
+    return bool(re.search(r"action|command|cmd|target|desired|goal|setpoint|master|leader", entry, re.IGNORECASE))
 
 
 def _key(name: str) -> str:

@@ -132,7 +132,7 @@ def _type_store() -> Any:
 
 def is_rosbag2(path: Path) -> bool:
     """Whether a path is a bag, or a folder of bags."""
-    return path.suffix in BAG_FILES if path.is_file() else bool(_bags(path))
+    return path.suffix.lower() in BAG_FILES if path.is_file() else bool(_bags(path))
 
 
 def _bags(path: Path) -> list[Path]:

@@ -115,4 +115,4 @@ def _rows(motions: Mapping[str, Motion], kept: Sequence[str]) -> np.ndarray:
 
 def _write(path: Path, lines: Sequence[str]) -> None:
     content = ("\n".join(lines) + "\n").encode()
-    path.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
+    path.write_bytes(gzip.compress(content, mtime=0) if path.suffix.lower() == ".gz" else content)

@@ -9,7 +9,16 @@ import numpy as np
 
 from mimic.motions.formats.cells import Cells, read_cells
 from mimic.motions.formats.episodes import ANGLE, VELOCITY, Motion, Quantity, Recording
-from mimic.motions.formats.names import QUANTITIES, SECONDS, Column, Selection, hand_position, parse_column, select
+from mimic.motions.formats.names import (
+    QUANTITIES,
+    SECONDS,
+    Column,
+    Selection,
+    common_unit,
+    hand_position,
+    parse_column,
+    select,
+)
 
 TABLES = tuple(suffix + packed for suffix in (".csv", ".tsv", ".txt", ".dat") for packed in ("", ".gz"))
 TIMES = ("time", "times", "t", "timestamp", "timestamps", "stamp", "elapsed", "seconds", "sec")
@@ -66,10 +75,12 @@ def read_table(path: Path, joints: Sequence[str], rate: float | None = None) -> 
     selection = select(str(path), {"columns": list(angles)}, joints, "", "table")
     if words := [name for name in selection.joints if not np.isfinite(table[:, angles[name]]).any()]:
         raise ValueError(f"source: {str(path)!r} has no number in the column of {words[0]}")
+    held = [(column.joint, column.quantity) for column in columns]
+    if twice := [name for name in selection.joints if max(held.count((name, of)) for of in names) > 1]:
+        raise ValueError(f"source: {str(path)!r} has several columns with the name of {twice[0]}; expected one")
     time, line = np.arange(len(table)) / (rate or 1), ""
     if time_at is not None and not rate:
-        unit = columns[time_at].unit or re.split(r"[^a-zµ]+", columns[time_at].joint.lower())[-1]
-        time, line = seconds(path, table[:, time_at], unit if unit in SECONDS else columns[time_at].unit)
+        time, line = seconds(path, table[:, time_at], unit_of_time(columns[time_at]))
     qvel = _velocities(path, table, names[VELOCITY], selection)
     gripper = table[:, [angles[name] for name in selection.gripper]] if selection.gripper else None
     found = hand_position({"": list(angles)})
@@ -77,7 +88,7 @@ def read_table(path: Path, joints: Sequence[str], rate: float | None = None) -> 
     motion = Motion(time, table[:, [angles[name] for name in selection.joints]], qvel, gripper, hand)
     labels = np.array(content.episodes)
     motions = {label: motion.take(labels == label) for label in dict.fromkeys(content.episodes)}
-    unit = next(filter(None, (columns[angles[name]].unit for name in selection.joints)), "")
+    unit = common_unit(str(path), {name: columns[angles[name]].unit for name in selection.joints})
     lines = (*notes, *selection.notes, *filter(None, [line]))
     return Recording(motions, unit=unit, notes=lines, **selection.facts)
 
@@ -143,7 +154,7 @@ def tables_by_quantity(folder: Path) -> dict[Quantity | str, Path]:
     for path in sorted(folder.iterdir()):
         words = re.split(r"[^a-z]+", path.name.lower().split(".")[0])
         kinds = ["time" for word in words if word in TIMES] + [QUANTITIES[word] for word in words if word in QUANTITIES]
-        if path.name.endswith(TABLES) and len(kinds) == 1:
+        if path.name.lower().endswith(TABLES) and len(kinds) == 1:
             if kinds[0] in found:
                 return {}
             found[kinds[0]] = path
@@ -171,8 +182,21 @@ def _word(name: str) -> str:
     return words[-1] if words else name.lower()
 
 
+def is_time(column: Column) -> bool:
+    """Whether a column or data set has times, by its name."""
+    return _word(column.joint) in TIMES
+
+
+def unit_of_time(column: Column) -> str:
+    """The unit of a column of times, by its name: `time [ms]`, `time_ms`; empty for none."""
+    last = re.split(r"[^a-zµ]+", column.joint.lower())[-1]
+    return column.unit or (last if last in SECONDS else "")
+
+
 def seconds(path: Path, time: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
     """Times in s, from a unit that is stated, or from the size of a clock's; and a line about what was found."""
+    if len(time) and not np.isfinite(time).any():
+        raise ValueError(f"source: {str(path)!r} has no number as time, nor dates as 2024-05-01T12:00:00.5")
     line = ""
     if not unit and len(time):
         unit = next((unit for least, unit in _CLOCKS if np.nanmax(np.abs(time)) >= least), "")
@@ -184,8 +208,8 @@ def seconds(path: Path, time: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
     seconds = (time - time[:1]) * SECONDS[unit]
     if len(time) > 1 and not (interval := float(np.nanmedian(np.diff(seconds)))) < _SLOWEST:
         raise ValueError(
-            f"source: the samples of {str(path)!r} are {interval:g} s apart; expected times in s, or a column that is "
-            "called time_ms, time_us or time_ns"
+            f"source: the samples of {str(path)!r} are {interval:g} s apart, expected less than {_SLOWEST:g} s; times "
+            "in another unit are called time_ms, time_us or time_ns"
         )
     return seconds, line
 

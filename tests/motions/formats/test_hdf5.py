@@ -54,7 +54,7 @@ ACT = {"observations/qpos": np.hstack([ANGLES, FINGER]), "observations/qvel": np
 DROID = {
     "observation/robot_state/joint_positions": ANGLES, "observation/robot_state/joint_velocities": SPEEDS,
     "observation/robot_state/gripper_position": FINGER[:, 0], "action/joint_position": ANGLES + 1,
-    "observation/timestamp": 1_700_000_000_000 + 1000 * TIME,
+    "observation/stamp_ms": 1000 * TIME,
 }  # fmt: skip
 ENVIRONMENT = json.dumps({"env_name": "Lift", "env_kwargs": {"control_freq": 20}})
 
@@ -63,9 +63,9 @@ ENVIRONMENT = json.dumps({"env_name": "Lift", "env_kwargs": {"control_freq": 20}
     ("content", "attributes", "rate", "names"),
     [
         (ROBOMIMIC, {"data": {"env_args": ENVIRONMENT}}, None, ["demo_0"]),
-        (ACT, {}, 20.0, [""]),
-        (ACT, {"observations": {}, "/": {"fps": 20}}, None, [""]),
-        (DROID, {}, None, [""]),
+        (ACT, {}, 20.0, ["a"]),
+        (ACT, {"observations": {}, "/": {"fps": 20}}, None, ["a"]),
+        (DROID, {}, None, ["a"]),
     ],
 )
 def test_observed_joints_are_read_with_their_gripper(tmp_path, content, attributes, rate, names):
@@ -105,20 +105,38 @@ def test_two_arms_are_a_question_that_numbers_or_a_topic_answer(tmp_path):
     both = write(
         tmp_path / "a.h5", {"observations/qpos": np.hstack([ANGLES, FINGER, ANGLES + 1, FINGER])}, {"/": {"fps": 20}}
     )
-    np.testing.assert_array_equal(read_hdf5(both, ["4", "5"]).motions[""].qpos, ANGLES + 1)
+    np.testing.assert_array_equal(read_hdf5(both, ["4", "5"]).motions["a"].qpos, ANGLES + 1)
     content = {"obs/robot0_joint_pos": ANGLES, "obs/robot1_joint_pos": ANGLES + 1,
                "obs/robot0_gripper_qpos": FINGER, "obs/robot1_gripper_qpos": -FINGER}  # fmt: skip
     two = write(tmp_path / "b.h5", content, {"/": {"fps": 20}})
     with pytest.raises(ValueError, match="expected one, as topic=obs/robot0_joint_pos or topic=obs/robot1_joint_pos"):
         read_hdf5(two, JOINTS)
-    motion = read_hdf5(two, JOINTS, "obs/robot1_joint_pos").motions[""]
+    motion = read_hdf5(two, JOINTS, "obs/robot1_joint_pos").motions["b"]
     np.testing.assert_array_equal(motion.qpos, ANGLES + 1)
     np.testing.assert_array_equal(motion.gripper, -FINGER)
+
+
+def test_an_empty_episode_is_left_out(tmp_path):
+    content = {f"demo_{number}/qpos": ANGLES[: COUNT * (number != 1)] for number in range(3)}
+    source = write(tmp_path / "a.h5", content, {"/": {"fps": 20}})
+    recording = read_recording(source, mimic.planar_arm([1.0, 1.0]))
+    assert [name.split()[0] for name in recording.motions] == ["demo_0", "demo_2"]
+    assert any(line.startswith("left out: demo_1 in") for line in recording.notes)
 
 
 @pytest.mark.parametrize(
     ("content", "attributes", "message"),
     [
+        (
+            {"demo_0/qpos": ANGLES, "demo_1/qpos": ANGLES[:, :1]},
+            {"/": {"fps": 20}},
+            "/demo_1 has 1 columns as qpos, expected 2",
+        ),
+        (
+            {"demo_0/qpos": ANGLES, "demo_1/force": ANGLES},
+            {"/": {"fps": 20}},
+            "/demo_1 has 0 columns as qpos, expected 2",
+        ),
         (ACT, {}, "states no times: .* expected rate=, samples per second"),
         ({"actions": ANGLES}, {}, "no data set with the joints joint1, joint2; its joint angles: none"),
         ({"text": np.array([b"a"])}, {}, "has no data sets of angles"),

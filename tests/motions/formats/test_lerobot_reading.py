@@ -32,7 +32,7 @@ def test_what_was_written_is_read(written, joints, feature):
         np.testing.assert_array_equal(motion.qvel, arm.qvel[episode, : steps + 1].astype(np.float32))
 
 
-def foreign(folder, *, names, version="v3.0", fps=20, **columns):
+def foreign(folder, *, names, version="v3.0", fps=20, units=None, **columns):
     """A dataset as others have it: without statistics and episodes, rows in any order, lists of any size."""
     rows = 2 * STEPS
     state = np.arange(rows * 2, dtype=np.float32).reshape(rows, 2)
@@ -43,7 +43,7 @@ def foreign(folder, *, names, version="v3.0", fps=20, **columns):
         "timestamp": (np.tile(np.arange(STEPS), 2) / 20).astype(np.float32),
         **columns,
     }
-    form = {"dtype": "float32", "shape": [2], "names": names}
+    form = {"dtype": "float32", "shape": [2], "names": names, "units": units}
     info = {"codebase_version": version, "fps": fps, "features": {"observation.state": form}}
     (folder / "meta").mkdir(parents=True)
     (folder / "data/chunk-000").mkdir(parents=True)
@@ -100,6 +100,7 @@ NULLS = [None, *[[0.0, 0.0]] * (2 * STEPS - 1)]
         ({"fps": 0}, r"expected frames per second in .* got 0"),
         ({"names": ["a"]}, r"has no feature with the joints a, b; its joint angles: none"),
         ({"names": ["a", "c"]}, r"its joint angles: observation.state \(a, c\); joints=\[...\] names"),
+        ({"units": ["deg", "rad"]}, "has a in 'deg', b in 'rad'; expected all angles in rad, in deg"),
         ({"observation.state": NULLS}, "expected numbers, got missing values"),
         ({"observation.state": [["x", "y"]] * 2 * STEPS}, "expected numbers, got string"),
         ({"observation.state": [[1.0], *[[0.0, 0.0]] * (2 * STEPS - 1)]}, "expected lists of one length, got 1 to 2"),

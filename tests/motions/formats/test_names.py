@@ -46,6 +46,11 @@ def test_columns(text, expected):
         (["joint1", "joint2"], ["panda_joint1", "panda_joint2"], ["joint1", "joint2"]),
         (["1", "2", "3"], ["shoulder", "elbow"], ["1", "2"]),
         (["left_joint1", "left_joint2", "right_joint1", "right_joint2"], ["joint1", "joint2"], None),
+        (
+            ["target_joint1", "target_joint2", "joint1_x", "actual_joint1", "actual_joint2"],
+            ["joint1", "joint2"],
+            ["actual_joint1", "actual_joint2"],
+        ),
         (["left_joint1", "right_joint2"], ["joint1", "joint2"], None),
         (["a", "A"], ["b"], None),
     ],

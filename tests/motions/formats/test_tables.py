@@ -45,6 +45,9 @@ SPELLINGS = {
         for row in np.column_stack([TIME, QPOS, QVEL])
     ),
     "decimal commas between tabs": text(HEADER, TIME, QPOS, QVEL, separator="\t", decimal=","),
+    "a topic of ROS": text(["%time", "field.header.seq", "field.position0", "field.position1", "field.velocity0",
+                            "field.velocity1"], 1.7e9 + TIME, 9 + TIME, QPOS, QVEL),
+    "elements of arrays": text(["time", "q[0]", "q[1]", "dq[0]", "dq[1]"], TIME, QPOS, QVEL),
     "other columns": text(["frame", *HEADER, "force_x"], 50 * TIME, TIME, QPOS, QVEL, 9 + TIME),
 }  # fmt: skip
 
@@ -75,7 +78,7 @@ def test_assumptions_about_a_table_are_lines(tmp_path):
 
 
 def test_units_grippers_and_missing_cells(tmp_path):
-    content = text(["t", "shoulder [deg]", "elbow [deg]", "gripper"], TIME, QPOS, TIME).replace("0.500000", "")
+    content = text(["t", "shoulder [deg]", "elbow (Deg.)", "gripper"], TIME, QPOS, TIME).replace("0.500000", "N/A")
     recording = read(tmp_path, content)
     (motion,) = recording.motions.values()
     assert recording.unit == "deg" and recording.gripper == ("gripper",) and motion.gripper is not None
@@ -107,7 +110,12 @@ def test_a_packed_folder_with_a_table_for_each_quantity(tmp_path):
         ("time,shoulder\n1,2\n", "has no table with the joints shoulder, elbow; its joint angles: columns .shoulder"),
         ("time,shoulder,elbow,dq_elbow\n0,1,2,3\n", "has velocities of some joints, but none of shoulder"),
         ("0,1,2,3\n", "has no header and 4 columns; expected time and the angles of 2 joints"),
-        ("time,shoulder,elbow\n0,1,2\n20,1,2\n40,1,2\n", "are 20 s apart; expected times in s, or .* time_ms"),
+        ("time,shoulder,elbow\n0,1,2\n20,1,2\n40,1,2\n", "are 20 s apart, expected less than .* time_ms"),
+        ("time,shoulder,elbow\n12:00:00,1,2\n12:00:01,1,2\n", "has no number as time, nor dates as"),
+        ("time,shoulder,elbow,shoulder,elbow\n0,1,2,3,4\n", "several columns with the name of shoulder"),
+        ("time,shoulder [mrad],elbow [mrad]\n0,1,2\n", "has elbow in 'mrad'; expected all angles in rad, in deg"),
+        ("time,shoulder [deg],elbow [rad]\n0,1,2\n", "has shoulder in 'deg', elbow in 'rad'; expected all angles"),
+        ("time,shoulder,elbow\n0,1,2,\n1,1,2,\n", "its rows have 4 cells, its header 3"),
         ("time [min],shoulder,elbow\n0,1,2\n", "are in 'min', expected s, sec, ms"),
         (b"\xff\xfe\x00", "expected text in UTF-8"),
     ],
