@@ -188,7 +188,9 @@ def write_data_set(
     replacement = Replacement(learner.name, learner.joint_names, data.joints, in_unit, list(kept), grippers, yaw)
     if write := _writer(data):
         lines = write(data.path, out, replacement)
-        return [line if ":" in line else f"left out, as it is not known of {learner.name}: {line}" for line in lines]
+        names = ", ".join(line for line in lines if ":" not in line)
+        left_out = [f"left out, as not known of {learner.name}: {names}"] if names else []
+        return [*(line for line in lines if ":" in line), *left_out]
     arrays = {"joint_names": np.array(learner.joint_names)}
     arrays["qpos"] = np.concatenate([motion.qpos for motion in chosen])
     arrays["qvel"] = np.concatenate([motion.qvel for motion in chosen])  # type: ignore[misc]

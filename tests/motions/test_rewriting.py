@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -58,13 +59,17 @@ def rewrite(tmp_path, source, kept=None, **options):
         (["/js/joint1/position", "/js/joint2/position"], ["/js/joint1", "/js/joint2"], ["l1/position"]),
         ([*map(str, range(1, 13))], ["1", "2"], [*map(str, [1, 2, 3, *range(3, 13)])]),
         (["a [deg]", "b [deg]", "tau_a", "tau_b"], ["a", "b"], ["l1 [deg]", "l2 [deg]", "l3 [deg]"]),
+        (["q_d_a", "q_d_b", "q_a", "q_b", "b_cmd"], ["a", "b"], ["q_l1", "q_l2", "q_l3"]),
+        (["target_q_0", "target_q_1", "actual_q_0", "actual_q_1", "target_q_7"], ["actual 0", "actual 1"],
+         ["actual_q_0", "actual_q_1", "actual_q_2", "target_q_7"]),
+        (["joint1", "joint2", "finger_joint1"], ["joint1", "joint2"], ["l1", "l2", "l3", "finger_joint1"]),
     ],
 )  # fmt: skip
 def test_columns_are_called_as_those_before(names, old, expected):
     columns, dropped = replaced_columns(names, old, ["l1", "l2", "l3"])
     found = [column.name for column in columns]
     assert found[: len(expected)] == expected
-    assert dropped == [name for name in names if "tau" in name]
+    assert dropped == [name for name in names if re.search("tau|_d_|_cmd|target_q_[01]", name)]
 
 
 # --- LeRobot ----------------------------------------------------------------------------------------------------------
@@ -85,15 +90,20 @@ def lerobot(root, version):
     state["names"] = {"motors": state["names"]}
     info["features"]["observation.images.front"] = {"dtype": "video", "shape": [4, 4, 3], "names": ["h", "w", "c"]}
     info |= {"robot_type": "old", "splits": {"train": "0:2", "test": "2:3"}, "total_videos": 3}
+    speeds = [f"{name}.vel" for name in (*OLD, "gripper")]
+    info["features"]["observation.velocity"] = {"dtype": "float32", "shape": [4], "names": speeds}
     (root / "meta/info.json").write_text(json.dumps(info))
+    for file in (root / "data").rglob("*.parquet"):
+        table = pq.ParquetFile(file).read()
+        pq.write_table(table.append_column("observation.velocity", table["action"]), file)
     if version.startswith("v2"):
         (root / "videos/chunk-000/front").mkdir(parents=True)
         for episode in range(3):
             (root / f"videos/chunk-000/front/episode_{episode:06d}.mp4").write_bytes(b"video %d" % episode)
         rows = [{"episode_index": k, "tasks": ["t"], "length": count} for k, count in enumerate(COUNTS)]
         (root / "meta/episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-        stats = [{"episode_index": k, "stats": {"action": {"mean": [0.0] * 4}, "next.reward": {"mean": [7.0]}}}
-                 for k in range(3)]  # fmt: skip
+        of_episode = {"action": {"mean": [0.0] * 4}, "observation.velocity": {}, "next.reward": {"mean": [7.0]}}
+        stats = [{"episode_index": k, "stats": of_episode} for k in range(3)]
         (root / "meta/episodes_stats.jsonl").write_text("".join(json.dumps(row) + "\n" for row in stats))
     else:
         folder = root / "meta/episodes/chunk-000"
@@ -102,10 +112,11 @@ def lerobot(root, version):
         pq.write_table(pa.table({
             "episode_index": np.arange(3), "length": COUNTS, "dataset_from_index": ends - COUNTS,
             "dataset_to_index": ends, "stats/action/mean": [[0.0] * 4] * 3,
+            "stats/observation.velocity/mean": [[0.0] * 4] * 3,
             "videos/observation.images.front/from_timestamp": [0.0, 3.0, 5.5],
         }), folder / "file-000.parquet")  # fmt: skip
         (root / "meta/stats.json").write_text(
-            json.dumps({"action": {"mean": [0.0] * 4}, "next.reward": {"mean": [7.0]}})
+            json.dumps({"action": {"mean": [0.0] * 4}, "observation.velocity": {}, "next.reward": {"mean": [7.0]}})
         )
     return root
 
@@ -117,7 +128,8 @@ def test_a_lerobot_dataset(tmp_path, version):
     source = lerobot(tmp_path / "in", version)
     data, motions, out, lines = rewrite(tmp_path, source, kept=[0, 2], units="deg")
     assert (data.entry, data.commands, data.unit) == ("observation.state", ("action",), "deg")
-    assert lines == []
+    assert lines == ["left out, as not known of learner: observation.velocity"]
+    assert not [file for file in out.rglob("*") if file.is_file() and b"observation.velocity" in file.read_bytes()]
     info = json.loads((out / "meta/info.json").read_text())
     assert info["robot_type"] == LEARNER.name
     assert (info["total_episodes"], info["total_frames"]) == (2, COUNTS[0] + COUNTS[2])
@@ -190,6 +202,23 @@ def test_a_robomimic_file(tmp_path):
         assert demo["rewards"][5] == 5
         assert list(file["mask/train"]) == [b"demo_1"]
         assert file["data"].attrs["total"] == COUNTS[1] + COUNTS[2]
+
+
+def test_commanded_angles_of_an_act_file(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    time, qpos = expert_motion(60)
+    with h5py.File(tmp_path / "act.hdf5", "w") as file:
+        file.attrs["fps"] = RATE
+        file["observations/qpos"], file["observations/effort"], file["action"] = qpos, 9 * qpos, qpos + 0.05
+        file["leader_action"] = np.cos(30 * time)[:, None] * np.ones(3)
+    data, motions, out, lines = rewrite(tmp_path, tmp_path / "act.hdf5")
+    assert data.commands == ("action",)
+    assert "as in the source, since nothing tells what they command: leader_action" in lines
+    assert "left out, as not known of learner: observations/effort" in lines
+    with h5py.File(out / "act.hdf5") as file:
+        np.testing.assert_allclose(file["action"], motions["action"]["act"].qpos)
+        np.testing.assert_allclose(file["leader_action"][:, 0], np.cos(30 * time))
+        assert "effort" not in file["observations"]
 
 
 # --- tables and npz ---------------------------------------------------------------------------------------------------
@@ -316,14 +345,24 @@ def test_demonstrations_are_read_as_they_are(tmp_path, has_gripper):
     assert (written.gripper is not None) == has_gripper and written.gripper_names == data.gripper
 
 
-def test_an_episode_that_needs_repair_is_a_fault(tmp_path):
-    time, qpos = expert_motion(60)
-    rows = [np.c_[time, qpos, np.full(60, 0)], np.c_[time, qpos + np.where(time[:, None] > 1, 1.0, 0), np.full(60, 1)]]
-    header = ",".join(["time", *OLD, "demonstration"])
-    np.savetxt(tmp_path / "m.csv", np.concatenate(rows), delimiter=",", header=header, comments="")
-    data = read_data_set(tmp_path / "m.csv", EXPERT)
-    assert list(data.measured) == ["demonstration 0"]
-    assert "jumps" in data.faults["demonstration 1"]
+@pytest.mark.parametrize("kind", ["csv", "npz", "hdf5", "v2.1", "v3.0"])
+def test_an_episode_that_needs_repair_is_left_out_with_all_its_samples(tmp_path, kind):
+    pytest.importorskip("h5py"), pytest.importorskip("pyarrow")
+    episodes = []
+    for episode, count in enumerate(COUNTS):
+        time, qpos = expert_motion(count)
+        qpos[time > 1] += episode == 0  # rad, a jump
+        hand = np.stack([time, time, episode + time], axis=1)
+        speeds = np.gradient(qpos, time, axis=0)
+        episodes.append({"time": time, "qpos": qpos, "qvel": speeds, "action": qpos, "hand": hand})
+    source = write(tmp_path, kind, episodes)
+    data, motions, out, _ = rewrite(tmp_path, source)
+    assert ["jumps" in fault for fault in data.faults.values()] == [True]
+    back = read_source(out / source.name if source.is_file() else out, NEW, "", None).motions
+    assert len(back) == len(motions[data.entry]) == 2
+    for motion, expected, episode in zip(back.values(), motions[data.entry].values(), episodes[1:], strict=True):
+        np.testing.assert_allclose(motion.qpos, expected.qpos, atol=1e-6)  # float32
+        np.testing.assert_allclose(motion.hand, episode["hand"], atol=1e-6)
 
 
 @pytest.mark.parametrize(

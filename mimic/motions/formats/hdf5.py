@@ -13,7 +13,7 @@ from mimic.base.distribution import import_extra
 from mimic.base.files import check_file, read_text
 from mimic.motions.formats.episodes import EXTRA, MAX_NUMBERS, Motion, Recording
 from mimic.motions.formats.hdf5_objects import JOINTS, object_poses
-from mimic.motions.formats.names import Selection, hand_position, parse_column, select
+from mimic.motions.formats.names import Selection, hand_position, is_command, parse_column, select
 from mimic.motions.formats.tables import is_time, seconds, unit_of_time
 
 SUFFIXES = (".hdf5", ".h5")
@@ -25,6 +25,7 @@ OTHER_COPIES = "next_obs"  # robomimic's: the observations of the next sample
 _RATES = ("control_freq", "fps", "frequency", "hz", "rate")  # attributes; in Hz
 _ENVIRONMENTS = ("env_args", "env_info", "env_kwargs")  # attributes with such keys, as JSON
 _STEP_CONTROLLERS, ACTIONS = ("OSC", "IK"), "actions"  # robosuite's types of controllers of the hand
+_NEAR = 0.1  # of the range of all angles: how far commanded ones are from them
 _SIZES = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}  # of qpos and qvel, by MuJoCo's joints
 
 
@@ -134,7 +135,21 @@ def _entries(episode: Episode, layout: _Layout | None) -> dict[str, list[str]]:
         for name, width in _widths(episode)
         if _ANGLES.fullmatch(name.split("/")[-1])
     }
+    entries |= {
+        name: [str(number) for number in range(1, width + 1)]
+        for name, width in _widths(episode)
+        if is_command(name) and any(_follows(episode, name, entry) for entry in list(entries))
+    }
     return entries | ({STATES: list(layout.qpos)} if layout else {})
+
+
+def _follows(episode: Episode, command: str, entry: str) -> bool:
+    """Whether a data set of commands has the angles of another one as they were commanded: all columns are near."""
+    if episode.sets[command].shape != episode.sets[entry].shape or not len(episode.sets[entry]):
+        return False
+    angles = _columns(episode.sets[entry])
+    apart = np.median(np.abs(_columns(episode.sets[command]) - angles), axis=0)
+    return bool(np.all(apart < _NEAR * np.ptp(angles)))
 
 
 def _motion(episode: Episode, layout: _Layout | None, selection: Selection, rate: float | None) -> Motion:

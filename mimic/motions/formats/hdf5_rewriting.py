@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mimic.base.files import copy_file
-from mimic.motions.formats.episodes import Motion
+from mimic.motions.formats.episodes import TORQUE, Motion
 from mimic.motions.formats.hdf5 import (
     ACTIONS,
     MODEL,
@@ -19,6 +19,7 @@ from mimic.motions.formats.hdf5 import (
     step_controller,
     velocities_entry,
 )
+from mimic.motions.formats.names import is_command, quantity_of
 from mimic.motions.formats.replacing import Replacement, replaced_columns, replaced_values
 
 # robomimic's names, in place of states
@@ -28,7 +29,7 @@ _FUNCTIONS = {"_cos": np.cos, "_sin": np.sin}  # ends of names of data sets with
 
 
 def rewrite_hdf5(source: Path, out: Path, replacement: Replacement) -> list[str]:
-    """Writes the files into an empty folder, under their names; returns lines about what has moved.
+    """Writes the files into an empty folder, under their names; returns what has moved, and torques that are left out.
 
     Flattened states of a simulation belong to the expert's model: they are kept in the group `source` of the episode,
     and the learner's angles and velocities stand in `obs/robot0_joint_pos` and `obs/robot0_joint_vel`.
@@ -61,6 +62,13 @@ def _replace(episode: Any, label: str, replacement: Replacement) -> Iterator[str
     """Replaces the data sets of an episode."""
     if ACTIONS in episode.sets and (controller := step_controller(episode)):
         yield _turn_steps(episode.group, controller, replacement.yaw)
+    elif unknown := [name for name in episode.sets if is_command(name) and name not in replacement.old_joints]:
+        yield f"as in the source, since nothing tells what they command: {', '.join(unknown)}"
+    count = min(map(len, replacement.old_joints.values()))
+    for name, item in list(episode.sets.items()):
+        if quantity_of(name.split("/")[-1]) == TORQUE and item.ndim == 2 and item.shape[1] >= count:
+            del episode.group[name]
+            yield name
     for entry, old_joints in replacement.old_joints.items():
         motion = replacement.motions[entry][label]
         if entry == STATES and MODEL in episode.group.attrs:

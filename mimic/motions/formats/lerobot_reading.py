@@ -19,7 +19,7 @@ from mimic.motions.formats.episodes import (
     Recording,
 )
 from mimic.motions.formats.lerobot import DATA_FOLDER, EPISODES_FOLDER, FINAL, INFO
-from mimic.motions.formats.names import UNITS, common_unit, hand_position, parse_column, select
+from mimic.motions.formats.names import UNITS, common_unit, hand_position, parse_column, quantity_of, select
 
 _TIME_TOLERANCE = 1e-4  # s: LeRobot's own, between a timestamp and that of its frame
 _FLOATS = ("float32", "float64")
@@ -136,8 +136,9 @@ def _features(features: Mapping[str, Any]) -> dict[str, _Feature]:
         for index, name in enumerate(names):
             column = parse_column(name)
             joint = column.joint.removeprefix(EXPERT)
-            columns.setdefault(column.quantity, {})[joint] = index
-            if column.quantity == ANGLE:
+            quantity = quantity_of(str(feature)) if column.quantity == ANGLE else column.quantity
+            columns.setdefault(quantity, {})[joint] = index
+            if quantity == ANGLE:
                 own = stated[index] if len(stated) == len(names) else ""
                 units[joint] = column.unit or UNITS.get(own, own)
         entries[str(feature)] = _Feature(columns, units)

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from mimic.base.files import check_file, copy_file, read_json, read_text
+from mimic.motions.formats.episodes import ANGLE
 from mimic.motions.formats.lerobot import DATA_FOLDER, EPISODES_FOLDER, INFO, STATS, statistics
 from mimic.motions.formats.lerobot_reading import FINAL, feature_names, missing_videos, numbers
+from mimic.motions.formats.names import is_copy, numbers_joints, parse_column, quantity_of
 from mimic.motions.formats.replacing import Column, Replacement, replaced_columns, replaced_values
 
 _LINES, _STATS_LINES = "meta/episodes.jsonl", "meta/episodes_stats.jsonl"  # of version 2: a line for each episode
@@ -38,6 +40,12 @@ class _Plan:
                 )
             self.dropped += [f"{name} of {entry}" for name in dropped]
             self.features[entry] = _description(self.features[entry], self.columns[entry])
+        joints = [joint for found in replacement.old_joints.values() for joint in found]
+        self.left_out = [
+            name for name, form in self.features.items() if name not in self.columns and _is_of(name, form, joints)
+        ]
+        self.dropped += self.left_out
+        self.features = {name: form for name, form in self.features.items() if name not in self.left_out}
         kept = sorted(int(name.removeprefix(_EPISODE)) for name in replacement.kept)
         self.new_number = {old: new for new, old in enumerate(kept)}
         self.values: dict[int, _Arrays] = {}  # of the replaced features, by the old number of the episode
@@ -65,7 +73,7 @@ def rewrite_lerobot(source: Path, out: Path, replacement: Replacement) -> list[s
     """Writes the dataset into an empty folder, with episodes numbered anew and statistics of the new values.
 
     Returns:
-      The names of columns that are left out, which are torques of the expert.
+      The names of columns and features that are left out: torques and other values of the expert's joints.
     """
     info = read_json(source / INFO)
     plan = _Plan(info, replacement)
@@ -87,8 +95,18 @@ def rewrite_lerobot(source: Path, out: Path, replacement: Replacement) -> list[s
         for name in plan.columns:
             whole = np.concatenate([arrays[name] for arrays in plan.values.values()])
             stats[name] = _alike(statistics(whole), stats.get(name, {}))
+        stats = {name: value for name, value in stats.items() if name not in plan.left_out}
         _write_json(out / STATS, stats)
     return plan.dropped
+
+
+def _is_of(feature: str, form: Mapping[str, Any], joints: Sequence[str]) -> bool:
+    """Whether a feature that is not replaced has values of the expert's joints, such as velocities."""
+    names = [] if form.get("dtype") == "video" else feature_names(form)
+    if numbers_joints([*joints, *names]):
+        return quantity_of(feature) != ANGLE
+    found = [parse_column(name).joint for name in names]
+    return any(name in joints or is_copy(name, joints) for name in found)
 
 
 def _description(form: Mapping[str, Any], columns: Sequence[Column]) -> dict[str, Any]:
@@ -127,6 +145,7 @@ def _write_data(source: Path, out: Path, plan: _Plan, is_old: bool) -> None:
             index[rows] = plan.add(old, arrays, rows.stop - rows.start) + np.arange(rows.stop - rows.start)
             for name, values in arrays.items():
                 new[name].append(values)
+        table = table.drop_columns([name for name in plan.left_out if name in table.column_names])
         for name, parts in new.items():
             table = _with_column(table, name, np.concatenate(parts))
         table = _with_column(table, "episode_index", np.array([plan.new_number[old] for old in episode]))
@@ -167,6 +186,8 @@ def _with_lengths(table: Any, plan: _Plan) -> Any:
     if b"huggingface" in metadata:
         content = json.loads(metadata[b"huggingface"])
         features = content.get("info", {}).get("features", {})
+        for name in plan.left_out:
+            features.pop(name, None)
         for name, columns in plan.columns.items():
             if features.get(name, {}).get("length", -1) > 0:
                 features[name]["length"] = len(columns)
@@ -184,6 +205,8 @@ def _write_episodes(source: Path, out: Path, plan: _Plan) -> None:
         old = numbers(table["episode_index"]).astype(int)
         kept = np.isin(old, list(plan.new_number))
         table, old = table.filter(pa.array(kept)), old[kept]
+        gone = tuple(part for name in plan.left_out for part in (f"{FINAL}{name}", f"stats/{name}/"))
+        table = table.drop_columns([key for key in table.column_names if key.startswith(gone)])
         starts = np.array([plan.starts[number] for number in old])
         changed = {
             "episode_index": np.array([plan.new_number[number] for number in old]),
@@ -212,6 +235,8 @@ def _write_lines(source: Path, out: Path, plan: _Plan) -> None:
         rows = [json.loads(line) for line in read_text(source / name).splitlines() if line.strip()]
         rows = [row for row in rows if row["episode_index"] in plan.new_number]
         for row in rows:
+            for feature in plan.left_out if "stats" in row else ():
+                row["stats"].pop(feature, None)
             for feature in plan.columns if "stats" in row else ():
                 values = plan.values[row["episode_index"]][feature]
                 row["stats"][feature] = _alike(statistics(values), row["stats"].get(feature, {}))

@@ -26,6 +26,22 @@ _LEAF = re.compile(r"(|.*[./])([^./]+)")
 _NUMBERED = re.compile(r"([a-z]+)[./_ ]([a-z]+)[./_ ]?(\d+)", re.IGNORECASE)
 # Before a quantity's word.
 _WHOSE = "actual", "measured", "target", "desired", "commanded", "command", "joint", "robot", "state", "field"
+# Words beside the name of a joint in a column with other values of it.
+_COPIES = {
+    *_WHOSE,
+    "d",
+    "des",
+    "ref",
+    "reference",
+    "cmd",
+    "goal",
+    "setpoint",
+    "action",
+    "leader",
+    "follower",
+    "master",
+    "raw",
+}
 _COUNTED = re.compile(rf"((?:{'|'.join(_WHOSE)}|motor|servo|axis|dof|[ajq])*)(\d+)")
 _BY_ORDER = "by their order"
 _GRIPPER = re.compile(r"gripper|finger|jaw|knuckle", re.IGNORECASE)
@@ -61,7 +77,8 @@ class Selection(NamedTuple):
       gripper: those of the gripper's joints or opening.
       gripper_entry: the entry that has these; empty without a gripper.
       notes: what was assumed to find them.
-      commanded: other entries that have the joints, as they were commanded; none where the user names the entry.
+      commanded: other entries that have the joints, as they were commanded; of several none where the user names the
+        entry.
     """
 
     entry: str
@@ -93,6 +110,13 @@ def parse_column(text: str) -> Column:
     if (match := _NUMBERED.fullmatch(name)) and match[1].lower() in _WHOSE and match[2].lower() in QUANTITIES:
         return Column(f"{match[1]} {match[3]}", QUANTITIES[match[2].lower()], unit)
     return Column(name, ANGLE, unit)
+
+
+def quantity_of(entry: str) -> Quantity:
+    """What an entry has, by its name: angles where this tells nothing else."""
+    words = set(re.split(r"[^a-z]+", entry.lower())) - {"current"}  # also the present one
+    found = {QUANTITIES[word] for word in words if word in QUANTITIES}
+    return found.pop() if len(found) == 1 else ANGLE
 
 
 def common_unit(path: str, units: Mapping[str, str]) -> str:
@@ -209,8 +233,9 @@ def select(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str
         notes.append(f"joints: {', '.join(columns)}, found {rule}{among}; joints=[...] names others")
     if gripper and gripper_entry == name and all(column.isdigit() for column in gripper):
         notes.append(f"gripper: {', '.join(gripper)}, after the joints")
-    commanded = [] if entry else [other for other in considered if other != name and is_command(other)]
-    commanded = [other for other in commanded if find_joints(entries[other], joints)]
+    commands = [other for other in entries if is_command(other) and find_joints(entries[other], joints)]
+    is_clear = name not in commands and not (entry and len(commands) > 1)  # of several arms
+    commanded = commands if is_clear else []
     return Selection(name, columns, gripper, gripper_entry, notes, commanded)
 
 
@@ -236,6 +261,15 @@ def hand_position(entries: Mapping[str, Sequence[str]]) -> tuple[str, list[str]]
         if len(chosen) == 3:
             found.append((entry, chosen))
     return found[0] if len(found) == 1 else None
+
+
+def is_copy(name: str, joints: Sequence[str]) -> bool:
+    """Whether a column has other values of one of some joints, as commanded: `target_joint1`, `joint1_cmd`, `q_d_1`."""
+    return name not in joints and _without_words(name) in {_without_words(joint) for joint in joints} - {""}
+
+
+def _without_words(name: str) -> str:
+    return "_".join(word for word in re.split(r"[./_ ]+", name.lower()) if word not in _COPIES)
 
 
 def is_command(entry: str) -> bool:

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mimic.motions.formats.episodes import ANGLE, GRIPPER, VELOCITY, Motion, Quantity
-from mimic.motions.formats.names import numbers_joints, parse_column
+from mimic.motions.formats.episodes import ANGLE, EXPERT, GRIPPER, VELOCITY, Motion, Quantity
+from mimic.motions.formats.names import is_copy, numbers_joints, parse_column
 
 
 class Replacement(NamedTuple):
@@ -55,7 +55,8 @@ def replaced_columns(
     """The columns with those of one arm's joints replaced by another's, and the names of columns that are left out.
 
     Angles and velocities stand where the first ones of the expert stood, and are called as these were: by the learner's
-    names of joints, or by numbers where the source numbers them. Torques of the expert are none of the learner.
+    names of joints, or by numbers where the source numbers them. Torques of the expert are none of the learner, and
+    neither are other values of its joints, as commanded ones in the same table.
     Channels of `gripper` keep their names.
     """
     numbered = numbers_joints(old_joints)
@@ -64,14 +65,13 @@ def replaced_columns(
     replaced: set[Quantity] = set()
     for index, name in enumerate(names):
         parsed = parse_column(name)
-        # After a prefix of the reader's; a number is not the end of another one.
-        joint = next((old for old in old_joints if re.search(rf"(?<!\d(?=\d)){re.escape(old)}$", parsed.joint)), "")
-        if not joint and parsed.joint in gripper and parsed.quantity == ANGLE:
+        joint = parsed.joint.removeprefix(EXPERT)
+        if parsed.joint in gripper and parsed.quantity == ANGLE:
             columns.append(Column(name, index, GRIPPER, gripper.index(parsed.joint)))
-        elif not joint:
-            columns.append(Column(name, index))
-        elif parsed.quantity not in (ANGLE, VELOCITY):
+        elif joint in old_joints and parsed.quantity not in (ANGLE, VELOCITY) or is_copy(parsed.joint, old_joints):
             dropped.append(name)
+        elif joint not in old_joints:
+            columns.append(Column(name, index))
         elif parsed.quantity not in replaced:
             replaced.add(parsed.quantity)
             old = re.findall(r"\d+", joint)[-1] if numbered else joint

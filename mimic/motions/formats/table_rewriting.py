@@ -28,7 +28,7 @@ def rewrite_table(source: Path, out: Path, replacement: Replacement, timed: bool
       timed: whether the table has times.
 
     Returns:
-      The names of columns that are left out, which are torques of the expert.
+      The names of columns that are left out, see `replaced_columns`.
     """
     ((entry, old_joints),) = replacement.old_joints.items()
     motions = replacement.motions[entry]
@@ -37,7 +37,7 @@ def rewrite_table(source: Path, out: Path, replacement: Replacement, timed: bool
     columns, dropped = replaced_columns(names, old_joints, replacement.joints, gripper)
     separator = text.separator or _BLANK
     lines = [*text.comments, *([separator.join(column.name for column in columns)] if text.header else [])]
-    count = dict.fromkeys(motions, 0)
+    count = dict.fromkeys(episodes, 0)
     for row, episode in zip(text.rows, episodes, strict=True):
         if episode in replacement.kept:
             cells, motion, at = text.cells(row), motions[episode], count[episode]
@@ -78,17 +78,20 @@ def rewrite_archive(source: Path, out: Path, replacement: Replacement) -> list[s
     angle_at, velocity_at = addresses(kinds, names)
     place, others = names.index(old_joints[0]), [i for i, name in enumerate(names) if name not in old_joints]
     before, after = ([i for i in others if (i < place) == is_before] for is_before in (True, False))
-    rows = _rows(motions, replacement.kept)
+    rows, samples = _rows(content, replacement.kept), len(content["qpos"])
+    for key, array in content.items():
+        if array.ndim and len(array) == samples and key not in ("joint_names", "jnt_type", "split_points"):
+            content[key] = array[rows]
     kept = [motions[episode] for episode in replacement.kept]
     for channel, name in enumerate(replacement.grippers.get(entry, ("", ()))[1]):
         opening = np.concatenate([motion.gripper[:, channel] for motion in kept])  # type: ignore[index]
-        content["qpos"][rows, angle_at[names.index(name)]] = opening
+        content["qpos"][:, angle_at[names.index(name)]] = opening
     for key, at, of in (
         ("qpos", angle_at, lambda motion: motion.qpos),
         ("qvel", velocity_at, lambda motion: motion.qvel),
     ):
         if key in content:
-            old = content[key][rows]
+            old = content[key]
             parts = [[old[:, at[i] : at[i + 1]] for i in indices] for indices in (before, after)]
             new = np.concatenate([of(motion) for motion in kept]).astype(old.dtype)
             content[key] = np.concatenate([*parts[0], new, *parts[1]], axis=1)
@@ -103,14 +106,11 @@ def rewrite_archive(source: Path, out: Path, replacement: Replacement) -> list[s
     return []
 
 
-def _rows(motions: Mapping[str, Motion], kept: Sequence[str]) -> np.ndarray:
-    """The rows of the kept motions in the arrays of all."""
-    ends = np.cumsum([len(motion.time) for motion in motions.values()])
-    every: dict[str, Any] = {
-        episode: np.arange(end - len(motion.time), end)
-        for (episode, motion), end in zip(motions.items(), ends, strict=True)
-    }
-    return np.concatenate([every[episode] for episode in kept])
+def _rows(content: Mapping[str, Any], kept: Sequence[str]) -> np.ndarray:
+    """The samples of the kept motions in the arrays of all, whose names end in their numbers; see `read_archive`."""
+    points = np.atleast_1d(content.get("split_points", (0, len(content["qpos"])))).astype(int)
+    numbers = [int(episode.split()[-1]) for episode in kept]
+    return np.concatenate([np.arange(points[number], points[number + 1]) for number in numbers])
 
 
 def _write(path: Path, lines: Sequence[str]) -> None:

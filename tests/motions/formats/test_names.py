@@ -65,9 +65,17 @@ def test_what_was_measured_goes_before_what_was_commanded():
     selection = select("set", {"action": names, "observation.state": names}, names[:2], "", "feature")
     assert selection.entry == "observation.state" and selection.gripper == ["gripper"]
     assert selection.notes == ["observation.state: what was measured; topic=action is what was commanded"]
-    assert (
-        select("set", {"action": names, "observation.state": names}, names[:2], "action", "feature").entry == "action"
-    )
+    action = select("set", {"action": names, "observation.state": names}, names[:2], "action", "feature")
+    assert (action.entry, action.commanded) == ("action", [])
+
+
+@pytest.mark.parametrize(
+    ("entries", "expected"),
+    [(["action", "observation.state", "observation.effort"], ["action"]), (["a/state", "a/command", "b/command"], [])],
+)
+def test_commands_beside_a_named_entry_are_found_where_there_is_one(entries, expected):
+    measured = next(name for name in entries if name.endswith("state"))
+    assert select("set", dict.fromkeys(entries, ["a", "b"]), ["a", "b"], measured, "entry").commanded == expected
 
 
 @pytest.mark.parametrize(
