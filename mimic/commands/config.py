@@ -383,12 +383,7 @@ class RetargetConfig:
         check_ranges(self)
         check_choice("hand", self.hand, _HANDS)
         check_choice("failing", self.failing, _FAILING)
-        _ = self.placement
-
-    @property
-    def placement(self) -> list[float] | None:
-        """See `base_numbers`."""
-        return base_numbers(self.base)
+        base_numbers(self.base)
 
     def resolve(self) -> EnvConfig:
         """Returns the environment with the limits set in this config."""

@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,6 @@ _CAPTIONS = 56  # pixels below it; the title is above it
 _LEGEND_ROOM = 1.25  # height of the axes relative to the maximum distance, so that the legend hides no curve
 
 _LABELS_SIDE_BY_SIDE = 8  # below the bars; more are upright
-_LINES = 5  # of progress where there is no terminal
 _Frame = UInt8[np.ndarray, "height width 3"]
 Bounds = tuple[float, float, float, float]  # left, bottom, width, height as fractions of the frame
 
@@ -57,33 +56,15 @@ def prepare_video(config: RenderConfig) -> Callable[[], None]:
 
     def run() -> None:
         console = Console()
-        clip = _with_status(console, "computing the motion and its distances", compute_clip)
+        with console.status("computing the motion and its distances"):
+            clip = compute_clip()
         out.parent.mkdir(exist_ok=True)
         with scene:
             frames = draw_frames(scene, clip)
-            _write_video(out, _tracked(console, frames, len(clip.time)))
+            _write_video(out, track(frames, "rendering", len(clip.time), console=console, transient=True))
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
-
-
-def _with_status(console: Console, text: str, compute: Callable[[], Clip]) -> Clip:
-    """Computes a clip behind a status line; without a terminal, the line is printed."""
-    if not console.is_terminal:
-        console.print(text, highlight=False)
-    with console.status(text):
-        return compute()
-
-
-def _tracked(console: Console, frames: Iterator[_Frame], total: int) -> Iterator[_Frame]:
-    """The frames, behind a progress bar; without a terminal, a line after each fifth of them."""
-    if console.is_terminal:
-        yield from track(frames, total=total, description="rendering", console=console)
-        return
-    for number, frame in enumerate(frames, start=1):
-        yield frame
-        if number * _LINES // total > (number - 1) * _LINES // total:
-            console.print(f"rendering: {number} of {total} frames", highlight=False)
 
 
 def _new_video(config: RenderConfig, default_out: Path | None) -> Path:
@@ -214,7 +195,7 @@ def _similarity_at(clip: Clip, frame: int) -> dict[str, float]:
     return {name: float(values[frame]) for name, values in clip.similarity.items()}
 
 
-def _write_video(out: Path, frames: Iterator[_Frame]) -> None:
+def _write_video(out: Path, frames: Iterable[_Frame]) -> None:
     """Encodes the frames. The file gets its name when it is complete."""
     partial = out.with_name(f".{out.stem}.partial.mp4")
     try:
@@ -226,7 +207,7 @@ def _write_video(out: Path, frames: Iterator[_Frame]) -> None:
         partial.unlink(missing_ok=True)
 
 
-def _encode(file: Path, frames: Iterator[_Frame]) -> int:
+def _encode(file: Path, frames: Iterable[_Frame]) -> int:
     """Sends the frames to the encoder; returns the number sent."""
     writer = imageio_ffmpeg.write_frames(str(file), _SIZE, fps=FRAMES_PER_SECOND, quality=7, macro_block_size=2)
     with warnings.catch_warnings():  # JAX warns about forks; this one only starts the encoder

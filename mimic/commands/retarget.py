@@ -22,7 +22,7 @@ from mimic.base import compat
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import new_folder
 from mimic.commands.certificate_plot import plot_certificates
-from mimic.commands.config import RetargetConfig
+from mimic.commands.config import RetargetConfig, base_numbers
 from mimic.commands.retargeted_motions import MOTIONS, save_motions
 from mimic.metric.config import MetricConfig
 from mimic.motions.formats.episodes import Motion
@@ -95,7 +95,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], int]:
     config.costs.check_capsules(shapes[0])
     grippers = (gripper_range(env.expert), gripper_range(env.learner)) if data.grippers else (None, None)
     setting = _Setting(
-        expert, learner, env.metric, config.hand, config.placement, dt, config.seed, grippers,
+        expert, learner, env.metric, config.hand, base_numbers(config.base), dt, config.seed, grippers,
         mapped_grippers(data, grippers), config.costs, *shapes,
     )  # fmt: skip
 

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from mimic.base import compat
 from mimic.base.config import new_folder
-from mimic.base.distribution import import_extra, install_command
+from mimic.base.distribution import import_extra
 from mimic.commands.arm_keys import check_no_arms
 from mimic.commands.config import ViewConfig, base_numbers
 from mimic.commands.view_capture import (
@@ -26,7 +26,7 @@ from mimic.commands.view_capture import (
     read_clip,
     wait_for_arm,
 )
-from mimic.commands.view_server import check_port, is_installed, serve
+from mimic.commands.view_server import check_port, serve
 from mimic.envs.config import EnvConfig
 from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.episodes import EXTRA
@@ -58,11 +58,7 @@ def prepare_view(config: ViewConfig, overrides: Sequence[str] = ()) -> Callable[
       ValueError: viser is not installed, the port is in use, the arms or the run are invalid, or an override has no
         effect.
     """
-    if not is_installed():
-        raise ValueError(
-            "view: expected the package viser, which is not installed; install it with the extra 'view': "
-            f"{install_command('view')}"
-        )
+    import_extra("viser", "view", "view")
     check_port(config.host, config.port)
     if config.record:
         new_folder("record", config.record)

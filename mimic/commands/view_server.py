@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import importlib.util
 import io
 import socket
 import sys
@@ -21,11 +20,6 @@ if TYPE_CHECKING:
     from mimic.viewer.page import Page
 
 _MAX_STEP = 0.1  # s, maximum time step, so that arms do not jump after a pause of the process
-
-
-def is_installed() -> bool:
-    """Whether viser is installed."""
-    return importlib.util.find_spec("viser") is not None
 
 
 def check_port(host: str, port: int) -> None:
