@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
+import mujoco
 import numpy as np
 
 from mimic.base.distribution import import_extra
 from mimic.base.files import check_file, read_text
 from mimic.motions.formats.episodes import EXTRA, MAX_NUMBERS, Motion, Recording
-from mimic.motions.formats.hdf5_objects import JOINTS, object_poses
+from mimic.motions.formats.hdf5_objects import object_poses, skeleton
 from mimic.motions.formats.names import Selection, hand_position, is_command, parse_column, select
 from mimic.motions.formats.tables import is_time, seconds, unit_of_time
 
@@ -26,7 +27,6 @@ _RATES = ("control_freq", "fps", "frequency", "hz", "rate")  # attributes; in Hz
 _ENVIRONMENTS = ("env_args", "env_info", "env_kwargs")  # attributes with such keys, as JSON
 _STEP_CONTROLLERS, ACTIONS = ("OSC", "IK"), "actions"  # robosuite's types of controllers of the hand
 _NEAR = 0.1  # of the range of all angles: how far commanded ones are from them
-_SIZES = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}  # of qpos and qvel, by MuJoCo's joints
 
 
 class Episode(NamedTuple):
@@ -42,7 +42,7 @@ class _Layout(NamedTuple):
 
     qpos: dict[str, int]
     qvel: dict[str, int]
-    model: ElementTree.Element
+    model: mujoco.MjModel
 
 
 def is_hdf5(path: Path) -> bool:
@@ -180,7 +180,8 @@ def _motion(episode: Episode, layout: _Layout | None, selection: Selection, rate
     steps, objects = _hand_steps(episode, len(qpos)), None
     if layout and len(episode.sets[STATES]) == len(qpos):  # an arm is before the objects
         joints = selection.joints if selection.entry == STATES else list(layout.qpos)[: qpos.shape[1]]
-        objects = object_poses(layout.model, layout.qpos, _columns(episode.sets[STATES]), joints)
+        numbers = [list(layout.qpos).index(name) for name in joints]
+        objects = object_poses(layout.model, _columns(episode.sets[STATES]), numbers)
     return Motion(_times(episode, len(qpos), layout, rate), qpos, qvel, gripper, hand, steps, objects)
 
 
@@ -271,36 +272,13 @@ def _layout(file: Path, episode: Episode) -> _Layout | None:
     if not text.lstrip().startswith("<"):
         places = [folder / Path(text).name for folder in (file.parent, file.parent / "models")]  # of robosuite 1.0
         text = read_text(next(filter(Path.is_file, places), places[0]))
-    if "<!" in text.replace("<!--", ""):
-        raise ValueError("the model declares a document type, expected elements alone")
-    root = ElementTree.fromstring(text)
-    types = {
-        default.get("class"): joint.get("type")
-        for default in root.iter("default") for joint in default.findall("joint") if joint.get("type")
-    }  # fmt: skip
-    names, sizes = [], []
-    for body in root.findall("worldbody"):
-        for joint in _joints(body):
-            kind = "free" if joint.tag == "freejoint" else joint.get("type") or types.get(joint.get("class"), "hinge")
-            names.append(joint.get("name", f"unnamed joint {len(names) + 1}"))
-            sizes.append(_SIZES[str(kind)])
-    ends = np.cumsum(sizes, axis=0).reshape(-1, 2)
-    starts, width = ends - np.reshape(sizes, (-1, 2)), 1 + int(ends[-1].sum() if len(ends) else 0)
+    model = skeleton(text)
+    names = [model.joint(number).name or f"unnamed joint {number + 1}" for number in range(model.njnt)]
+    width = 1 + model.nq + model.nv
     if episode.sets[STATES].ndim != 2 or episode.sets[STATES].shape[1] < width:
         raise ValueError(f"states: expected {width} columns for the model, got {list(episode.sets[STATES].shape)}")
-    qvel = 1 + int(ends[-1, 0]) if len(ends) else 1
-    return _Layout(
-        {name: 1 + int(start) for name, (start, _) in zip(names, starts, strict=True)},
-        {name: qvel + int(start) for name, (_, start) in zip(names, starts, strict=True)},
-        root,
-    )
-
-
-def _joints(body: ElementTree.Element) -> Iterator[ElementTree.Element]:
-    """The joints of a body and those of its children, in MuJoCo's order."""
-    yield from (element for element in body if element.tag in JOINTS)
-    for child in body.findall("body"):
-        yield from _joints(child)
+    qpos, qvel = (1 + model.jnt_qposadr).tolist(), (1 + model.nq + model.jnt_dofadr).tolist()
+    return _Layout(dict(zip(names, qpos, strict=True)), dict(zip(names, qvel, strict=True)), model)
 
 
 def _text(value: Any) -> str:

@@ -1,12 +1,10 @@
 """Objects of robosuite's simulations against C MuJoCo."""
 
-from xml.etree import ElementTree
-
 import mujoco
 import numpy as np
 import pytest
 
-from mimic.motions.formats.hdf5_objects import object_poses
+from mimic.motions.formats.hdf5_objects import object_poses, skeleton
 
 MODEL = """<mujoco><compiler angle="radian" boundmass="1" boundinertia="1"/><worldbody>
 <body name="table" pos="1 2 3"/>
@@ -17,14 +15,15 @@ MODEL = """<mujoco><compiler angle="radian" boundmass="1" boundinertia="1"/><wor
   <body name="door" pos="0.3 0 0"><joint name="hinge" axis="1 2 2" pos="0.2 0.1 0"/>
     <body name="bolt" pos="0 0.1 0"><joint name="bolt" type="slide" axis="0 3 4"/></body></body></body>
 </worldbody></mujoco>"""
-COLUMNS = {"j1": 1, "jaw": 2, "cube": 3, "hinge": 10, "bolt": 11}
+ARM = [0, 1]
 OBJECTS = "cube", "door", "bolt"
 
 
 def test_poses_are_those_of_mujoco():
     model = mujoco.MjModel.from_xml_string(MODEL)
     data, states = mujoco.MjData(model), np.random.default_rng(0).normal(size=(5, 12))
-    found = object_poses(ElementTree.fromstring(MODEL), COLUMNS, states, ["j1"])
+    with_shape = MODEL.replace('<joint name="j1"/>', '<geom mesh="missing"/><joint name="j1"/>')
+    found = object_poses(skeleton(with_shape), states, ARM)
     assert found is not None
     for row, poses in zip(states, found, strict=True):
         data.qpos[:] = row[1:]
@@ -40,22 +39,20 @@ def pose_of(data, name):
     return pose
 
 
-@pytest.mark.parametrize(
-    "changes", [('<body name="door"', '<body euler="0 0 1" name="door"'), ('name="hinge"', 'name="other"'),
-                ('name="j1"', 'name="j2"'), ('<joint name="hinge"', '<joint type="ball" name="hinge"')]
-)  # fmt: skip
-def test_what_is_not_computed_has_no_objects(changes):
-    model = ElementTree.fromstring(MODEL.replace(*changes))
-    assert object_poses(model, COLUMNS, np.ones((2, 12)), ["j1"]) is None
-
-
-@pytest.mark.parametrize(("columns", "value"), [(slice(6, 10), 0), (3, np.nan), (10, np.inf)])
-def test_an_object_without_a_pose_is_none(columns, value):
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_states_that_are_not_finite_have_no_objects(value):
     states = np.ones((2, 12))
-    states[1, columns] = value
-    assert object_poses(ElementTree.fromstring(MODEL), COLUMNS, states, ["j1"]) is None
+    states[1, 3] = value
+    assert object_poses(skeleton(MODEL), states, ARM) is None
 
 
-def test_numbers_that_are_missing_are_named():
-    with pytest.raises(ValueError, match="expected 3 numbers as pos, got '0.3 0'"):
-        object_poses(ElementTree.fromstring(MODEL.replace("0.3 0 0", "0.3 0")), COLUMNS, np.ones((2, 12)), ["j1"])
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (("0.3 0 0", "0.3 0"), "Error"),
+        (("<worldbody>", "<worldbody>" + "<site/>" * 10_001), "more than 10,000 elements"),
+    ],
+)
+def test_a_model_that_cannot_be(changes, message):
+    with pytest.raises(ValueError, match=message):
+        skeleton(MODEL.replace(*changes))
