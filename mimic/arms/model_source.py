@@ -109,6 +109,7 @@ class _Reader:
         self._unusable = unusable
         is_top = folder.parent == folder.parent.parent  # everything would be next to it
         self._package = folder if is_top else folder.parent
+        self._places: dict[ElementTree.Element, Path] = {}  # files with an element that another file includes
         self.files: list[Path] = []
         self.missing: list[str] = []
         self.attached: dict[str, ElementTree.Element] = {}
@@ -177,11 +178,12 @@ class _Reader:
         if element.tag.lower() != "include":
             return [element]
         name = element.get("file", "")
-        part = self._file(name, (file.parent,), self._folder)
+        part = self._file(name, (file.parent, self._places.get(element, file).parent), self._folder)
         if part in included:
             raise ValueError(f"{self._unreadable}: it includes {name!r:.200} twice")
         included.add(part)
         root = self._parse(part)
+        self._places |= dict.fromkeys(root.iter("include"), part)
         for child in root.iter():
             child.text = child.tail = None  # lines of another file
         return root

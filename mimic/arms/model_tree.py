@@ -3,7 +3,7 @@
 import mujoco
 
 # As ints: a MuJoCo enum equals a NumPy integer in one order of the operands and not in the other.
-_REVOLUTE = int(mujoco.mjtJoint.mjJNT_HINGE)
+_REVOLUTE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _KINDS = {int(kind): kind.name.removeprefix("mjJNT_").lower() for kind in mujoco.mjtJoint.__members__.values()}
 
 
@@ -18,8 +18,10 @@ def joint_ids(model: mujoco.MjModel, body: int) -> range:
 
 
 def is_revolute(model: mujoco.MjModel, joint: int) -> bool:
-    """Whether a joint is revolute (MuJoCo: hinge)."""
-    return int(model.jnt_type[joint]) == _REVOLUTE
+    """Whether a joint is revolute (MuJoCo: hinge), and not that of a base that also slides along two axes."""
+    of_body = joint_ids(model, int(model.jnt_bodyid[joint]))
+    slides = sum(int(model.jnt_type[other]) == _SLIDE for other in of_body)
+    return int(model.jnt_type[joint]) == _REVOLUTE and slides < 2
 
 
 def ancestors(model: mujoco.MjModel, body: int) -> list[int]:

@@ -1,6 +1,8 @@
 """Reads the revolute joints and links of an arm from a MuJoCo model: a serial chain, or a tree."""
 
 import dataclasses
+import functools
+import logging
 import re
 from collections.abc import Callable, Sequence
 
@@ -20,11 +22,14 @@ START_POSES = "ready", "home"  # keyframes with the start pose of a model, in or
 
 # As ints: a MuJoCo enum equals a NumPy integer in one order of the operands and not in the other.
 _CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
-_ON_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
-_NO_BIAS = int(mujoco.mjtBias.mjBIAS_NONE)
+_ON_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_NO_BIAS, _AFFINE_GAIN = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtGain.mjGAIN_AFFINE)
 _WORLD = 0  # body
 _LINK, _PREFIXED = re.compile("link"), re.compile(r"(.*[^A-Za-z0-9])?link")  # names of sites
 _ALONG_AXIS = 1e-3  # rad; files round directions
+_SHORT, _LONG = 0.02, 25.0  # m, of all links together: others are in another unit
+
+_log = logging.getLogger(__name__)
 
 
 # Above 40 lines because of its docstring.
@@ -75,10 +80,18 @@ def read_chain(
         links = (_base_links(joints, paths) if has_base else []) + _anchor_links(joints, paths, tips)
     if hand is None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, UNKNOWN_HAND) >= 0:
         hands = ()
+    length = float(sum(link.length for link in links))
+    if not _SHORT <= length <= _LONG:
+        _warn_size(length)
     if len(paths) == 1:
         return Chain(tuple(joints), drop_zero_length(links), hands=hands)
     parents = tuple(_parent(joint, paths) for joint in range(len(joints)))
     return Chain(tuple(joints), drop_zero_length(links), parents, chain_ids.names, hands)
+
+
+@functools.cache  # warns once, though a run builds an arm several times
+def _warn_size(length: float) -> None:
+    _log.warning("the links of the arm are %.3g m long together: is its file in metres, as MJCF and URDF are?", length)
 
 
 def _check_names(joints: Sequence[Joint]) -> None:
@@ -229,9 +242,11 @@ def _torque_limit(model: mujoco.MjModel, joint_id: int) -> float:
     if model.jnt_actfrclimited[joint_id]:
         limits.append(np.abs(model.jnt_actfrcrange[joint_id]).max())
     for actuator in range(model.nu):
-        if model.actuator_trntype[actuator] == _ON_JOINT and model.actuator_trnid[actuator, 0] == joint_id:
+        if int(model.actuator_trntype[actuator]) in _ON_JOINT and model.actuator_trnid[actuator, 0] == joint_id:
             gear = abs(model.actuator_gear[actuator, 0])
             is_motor = model.actuator_biastype[actuator] == _NO_BIAS
+            if is_motor and model.actuator_gaintype[actuator] == _AFFINE_GAIN:
+                continue  # a damper, which only brakes
             if model.actuator_forcelimited[actuator]:
                 limits.append(gear * np.abs(model.actuator_forcerange[actuator]).max())
             if model.actuator_ctrllimited[actuator] and is_motor:

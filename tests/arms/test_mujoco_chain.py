@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mimic.arms import chain
+from mimic.arms import chain, mujoco_chain
 from mimic.arms.embodiment import load_arm, load_mjcf, panda, panda_path
 from mimic.arms.model_copy import copied_files
 from mimic.arms.model_source import read_source
@@ -165,6 +165,8 @@ def test_only_a_locked_joint_merges_links():
         ('<general joint="a" gear="2" gainprm="-10" ctrllimited="true" ctrlrange="-1 1"/>', 20),
         ('<motor joint="a" gear="2" ctrllimited="true" ctrlrange="-9 9" forcelimited="true" forcerange="-5 5"/>', 10),
         ('<motor joint="a" ctrllimited="true" ctrlrange="-9 9"/><motor joint="b" gear="5"/>', 9),
+        ('<motor jointinparent="a" ctrllimited="true" ctrlrange="-9 9"/>', 9),
+        ('<damper joint="a" kv="1" ctrlrange="0 2"/>', np.inf),  # brakes alone
     ],
 )
 def test_a_torque_limit_is_that_of_the_actuator_times_its_gear(actuators, expected):
@@ -205,6 +207,30 @@ def test_velocity_limits_of_an_arm_on_a_lift(numbers, expected):
         return
     with pytest.raises(ValueError, match="in velocity_limit; expected one for each of 3 joints, or .* the 2 revolute"):
         load_mjcf(model(lift, numeric))
+
+
+def test_the_rotation_of_a_base_that_slides_along_two_axes_is_no_joint_of_the_arm():
+    base = "".join(f'<joint name="{axis}" type="slide" axis="{vector}"/>' for axis, vector in
+                   (("x", "1 0 0"), ("y", "0 1 0")))  # fmt: skip
+    arm = load_mjcf(model(f'<body name="cart">{base}<joint name="yaw"/><geom size="1"/>{CHILD}</body>'))
+    assert arm.joint_names == ("a", "b")
+
+
+@pytest.mark.parametrize(("metres", "is_odd"), [(1.0, False), (1000.0, True), (0.001, True)])
+def test_an_arm_of_another_size_than_arms_have_is_a_warning(caplog, metres, is_odd):
+    mujoco_chain._warn_size.cache_clear()
+    load_mjcf(model(revolute("a", inner=f'<site name="tip" pos="{metres} 0 0"/>')))
+    assert (f"are {metres:.3g} m long together: is its file in metres" in caplog.text) == is_odd
+
+
+def test_an_included_file_may_be_beside_the_one_that_includes_it(tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts/arm.xml").write_text(f"<mujocoinclude>{CHILD}</mujocoinclude>")
+    (tmp_path / "parts/all.xml").write_text('<mujocoinclude><include file="arm.xml"/></mujocoinclude>')
+    (tmp_path / "robot.xml").write_text('<mujoco><worldbody><include file="parts/all.xml"/></worldbody></mujoco>')
+    assert load_mjcf(tmp_path / "robot.xml").joint_names == ("a", "b")
+    (tmp_path / "arm.xml").write_text(f"<mujocoinclude>{revolute('c', inner=TIP)}</mujocoinclude>")
+    assert load_mjcf(tmp_path / "robot.xml").joint_names == ("c",)  # beside the model counts first, as in MuJoCo
 
 
 def test_a_range_that_mujoco_ignores_is_a_line(tmp_path, caplog):
