@@ -12,7 +12,7 @@ import numpy as np
 
 from mimic.base.files import read_text
 from mimic.motions.mocap.names import END
-from mimic.motions.mocap.tables import numbers
+from mimic.motions.mocap.tables import frames_note, numbers
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 _CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)
@@ -190,8 +190,7 @@ def _motion(text: str, channels: int) -> tuple[np.ndarray, float, tuple[str, ...
         raise ValueError(f"MOTION: expected a multiple of {channels} values, one for each channel, got {len(values):,}")
     if frames < 2:
         raise ValueError(f"MOTION: expected at least 2 frames, got {frames}")
-    notes = () if frames == stated else (f"the header states {stated} frames, the file has {frames}",)
-    return values.reshape(frames, channels), frame_time, notes
+    return values.reshape(frames, channels), frame_time, frames_note(stated, frames)
 
 
 def _numbers(words: list[str], where: str) -> np.ndarray:

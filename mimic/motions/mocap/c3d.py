@@ -4,6 +4,7 @@ That process runs this file: it must import nothing of mimic at its start.
 """
 
 import importlib.util
+import struct
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
     from mimic.motions.mocap.tables import Table
 
 _OUTPUTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")  # of models, which are no markers
+_BLOCK, _BIG_ENDIAN, _LAST_FRAME = 512, b"\x56", 2**16 - 1  # bytes; code of the processor; also that of longer files
 _SECONDS, _MEMORY = 60, 4 * 2**30  # an hour of 100 markers at 100 Hz takes some seconds
 
 
@@ -21,9 +23,9 @@ def read_c3d(path: Path) -> "Table":
     Raises:
       ValueError: ezc3d is not installed, or it cannot read the file.
     """
-    from mimic.base.files import check_file
+    from mimic.base.files import check_file, read_bytes
     from mimic.base.limited_process import call_limited
-    from mimic.motions.mocap.tables import read_npz
+    from mimic.motions.mocap.tables import frames_note, read_npz
 
     if importlib.util.find_spec("ezc3d") is None:
         raise ValueError("C3D files need the package ezc3d: install mimic with the extra [mocap]")
@@ -35,7 +37,17 @@ def read_c3d(path: Path) -> "Table":
             call_limited(__file__, "write_points", source, str(points), library="ezc3d", what="the file", **limits)
         except ValueError as error:
             raise ValueError(f"ezc3d cannot read it: {error!s:.150}") from error
-        return read_npz(points)
+        table = read_npz(points)
+    stated = _stated_frames(read_bytes(path))
+    return table._replace(notes=(*table.notes, *frames_note(stated or len(table.time), len(table.time))))
+
+
+def _stated_frames(content: bytes) -> int:
+    """The number of frames in the header; 0 where it is too large for it. ezc3d reads a file that is cut off."""
+    processor = (content[0] - 1) * _BLOCK + 3  # place of its code
+    order = ">" if content[processor : processor + 1] == _BIG_ENDIAN else "<"
+    first, last = struct.unpack(f"{order}HH", content[6:10])
+    return last - first + 1 if first <= last < _LAST_FRAME else 0
 
 
 def write_points(source: str, points: str) -> None:

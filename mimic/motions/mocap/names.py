@@ -62,6 +62,8 @@ _IGNORED = {
     "tip",
     "def",
     "org",
+    "pos",
+    "position",
 }
 _SHORTEST = 3  # letters of a word that others may stand before
 _WORD = re.compile(

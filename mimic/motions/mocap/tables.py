@@ -12,7 +12,7 @@ from mimic.base.npz import read_arrays
 
 _MAX_POINTS = 2000
 _MAX_VALUE = 1e9
-_COLUMN = re.compile(r"(.+?)[ ._:]?([xyz])", re.IGNORECASE)
+_COLUMN = re.compile(r"(.+?)[ ._:]*([xyz])(?:\s*[\[(](.+)[\])])?", re.IGNORECASE)
 _TIME = re.compile(r"(time|t|timestamp|seconds)([ _]*[\[(]?(s|sec|seconds|ms|us|ns)[\])]?)?", re.IGNORECASE)
 _UNSEEN = {"", "-", "--", "null", "none", "na", "n/a", "missing"}  # cells of a point that was not seen
 _ARRAYS = ("names", "positions", "time", "rate", "parents", "unit", "up")
@@ -58,20 +58,30 @@ def read_trc(path: Path) -> Table:
     columns = 2 + 3 * len(names)
     values = _cells([(row + [""] * columns)[:columns] for row in rows], "TRC")
     positions = values[:, 2:].reshape(len(rows), len(names), 3)
-    try:
-        rate = float(header.get("DataRate", "nan"))
-    except ValueError:
-        rate = 0.0
-    return _checked(Table(names, positions, values[:, 1], header.get("Units") or None, rate=rate if rate > 0 else None))
+    rate, frames = (_stated_number(header.get(key, "")) for key in ("DataRate", "NumFrames"))
+    notes = frames_note(int(frames), len(rows)) if frames else ()
+    return _checked(Table(names, positions, values[:, 1], header.get("Units") or None, rate=rate or None, notes=notes))
+
+
+def frames_note(stated: int, found: int) -> tuple[str, ...]:
+    """A line where a file has another number of frames than its header states, as one that is cut off."""
+    return () if stated == found else (f"the header states {stated} frames, the file has {found}",)
+
+
+def _stated_number(text: str) -> float:
+    """A number of a header above 0; 0 for anything else."""
+    return max(float(text), 0.0) if _is_number(text) and abs(float(text)) <= _MAX_VALUE else 0.0
 
 
 def read_csv(path: Path) -> Table:
     """Points of a CSV table: a column of times, and three columns for each point, as in `wrist_x, wrist_y, wrist_z`.
 
+    A unit may follow, as in `wrist_x [mm]`. Lines that begin with `#` are comments.
+
     Raises:
       ValueError: what is missing or wrong.
     """
-    lines = read_text(path, errors="replace").splitlines()
+    lines = [line for line in read_text(path, errors="replace").splitlines() if not line.startswith("#")]
     separator = max(",;\t", key=(lines or [""])[0].count)
     reader = csv.reader(lines, delimiter=separator)
     try:
@@ -81,16 +91,23 @@ def read_csv(path: Path) -> Table:
         raise ValueError(f"it is not a CSV table: {error}") from error
     time = [i for i, name in enumerate(header) if _TIME.fullmatch(name)]
     columns: dict[str, dict[str, int]] = {}
+    units: dict[str, None] = {}
     for index, name in enumerate(header):
         if index not in time and (match := _COLUMN.fullmatch(name)):
             columns.setdefault(match[1], {})[match[2].lower()] = index
+            units |= {match[3].strip(): None} if match[3] else {}
     points = {name: axes for name, axes in columns.items() if len(axes) == 3}
     if not time or not points:
-        raise ValueError("expected a column 'time' and, for each point, NAME_x, NAME_y, NAME_z")
+        raise ValueError(
+            f"expected a column 'time' and, for each point, NAME_x, NAME_y, NAME_z; got {', '.join(header)[:200]!r}"
+        )
+    if len(units) > 1:
+        raise ValueError(f"expected all points in one unit, got {', '.join(units)}")
     if any(len(row) != len(header) for row in rows):
         raise ValueError(f"expected {len(header)} cells in each row")
     values = _cells(rows, "CSV", [time[0], *(axes[a] for axes in points.values() for a in "xyz")])
-    return _checked(Table(tuple(points), values[:, 1:].reshape(len(rows), len(points), 3), values[:, 0]))
+    positions = values[:, 1:].reshape(len(rows), len(points), 3)
+    return _checked(Table(tuple(points), positions, values[:, 0], next(iter(units), None)))
 
 
 def read_npz(path: Path) -> Table:

@@ -145,6 +145,37 @@ def test_uneven_times_are_resampled(tmp_path, expected):
     assert any("resampled" in note for note in motion.notes)
 
 
+def test_a_trc_file_that_is_cut_off_is_a_note(tmp_path, expected):
+    path = _trc(tmp_path / "clip.trc", _markers(expected, MARKERS))
+    path.write_text("\n".join(path.read_text().splitlines()[:-10]))
+    assert f"the header states {SAMPLES} frames, the file has {SAMPLES - 10}" in read_motion(path).notes
+
+
+@pytest.mark.parametrize(
+    ("header", "scale", "note"),
+    [
+        ("{}_pos_{}", 1.0, "unit: m, found from the length of the arms"),
+        ("{} {} (mm)", 1000.0, None),
+        ("{} {} [cm]", 1000.0, "unit: the file states cm, in which its arms have lengths of 5.3"),
+        ("{}: {}[mm] ", 1.0, "unit: the file states mm, in which"),
+    ],
+)
+def test_headers_of_csv(tmp_path, expected, header, scale, note):
+    """Of units that are stated none is guessed, and one in which no person is that long is rejected."""
+    motion = _markers(expected, MARKERS)
+    names = ["time", *(header.format(name, axis) for name in motion.names for axis in "XYZ")]
+    rows = np.c_[np.arange(SAMPLES) / RATE, scale * motion.positions.reshape(SAMPLES, -1)]
+    path = tmp_path / "clip.csv"
+    np.savetxt(path, rows, delimiter=",", header=f"# a capture\n{','.join(names)}", comments="")
+    if note and "states" in note:
+        with pytest.raises(ValueError, match=note):
+            read_motion(path)
+        return
+    found = read_motion(path)
+    np.testing.assert_allclose(found.positions, motion.positions, atol=1e-6)
+    assert [line for line in found.notes if line.startswith("unit")] == ([note] if note else [])
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -352,6 +383,11 @@ def test_c3d(tmp_path, expected):
     motion = _c3d(tmp_path / "clip.c3d", 1000 * tracks, LABELS=names)
     assert motion.names == tuple(names) and motion.rate == RATE
     np.testing.assert_allclose(motion.positions, tracks, atol=1e-6)
+    content = (tmp_path / "clip.c3d").read_bytes()
+    (tmp_path / "cut.c3d").write_bytes(content[: len(content) - 20 * 4 * 16])  # 20 frames of 4 points of 16 bytes
+    cut = read_motion(tmp_path / "cut.c3d")
+    assert len(cut.positions) < SAMPLES
+    assert f"the header states {SAMPLES} frames, the file has {len(cut.positions)}" in cut.notes
 
 
 def test_c3d_with_many_labels_outputs_of_models_and_a_vertical(tmp_path, expected):
