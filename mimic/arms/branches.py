@@ -8,6 +8,7 @@ import mujoco
 from mimic.arms.model_tree import ancestors, is_revolute, joint_ids
 from mimic.arms.names import hand_rank, is_gripper_joint, is_other_limb
 from mimic.arms.tool_frames import named_frame
+from mimic.base.overrides import setting
 
 _MAX_ENDS = 6  # in a message
 
@@ -42,10 +43,11 @@ def longest_branch(model: mujoco.MjModel, start: int) -> int:
     names = [tool or named_frame(model, end, hand_rank) or model.body(end).name
              for tool, end in zip(tools, ends, strict=True)]  # fmt: skip
     likeliest = next(filter(None, tools), names[0])
+    listed = ", ".join(map(repr, names[:_MAX_ENDS])) + " and others" * (len(names) > _MAX_ENDS)
     raise ValueError(
-        f"the model branches: {len(ends)} chains of {total} revolute joints end at "
-        f"{', '.join(map(repr, names[:_MAX_ENDS]))}{' and others' if len(names) > _MAX_ENDS else ''}; name one, as in "
-        f'tip={likeliest}, several, as in tip=[{",".join(names[:2])}], or all ends of the model with tip=["*"]'
+        f"the model branches: {len(ends)} chains of {total} revolute joints end at {listed}; name one, as in "
+        f"{setting('tip', likeliest)}, several, as in {setting('tip', names[:2])}, or all ends of the model with "
+        'tip=["*"]'
     )
 
 

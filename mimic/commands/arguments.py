@@ -4,14 +4,19 @@ Hydra also composes what nobody means: an environment without a preset for `~env
 `env={}`.
 """
 
+import os
+import re
 from typing import Any, NoReturn
 
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
 
 from mimic.base import registry
+from mimic.base.overrides import setting
 
+_SPECIAL = re.compile(r"[^\w./:@+-]|[^\x00-\x7f]")  # characters that Hydra does not take as text, or not always
 GROUPS = {"env": "panda4dof", "trainer": "ppo", "metric": "paper"}  # config groups, with the example of messages
 
 
@@ -32,6 +37,24 @@ def load_plugins(arguments: list[str]) -> list[str]:
         else:
             others.append(argument)
     return others
+
+
+def quoted(argument: str) -> str:
+    """A setting with its value in quotes, where that is a file or text that is no Hydra syntax: `arm (1).urdf`."""
+    key, equals, value = argument.partition("=")
+    if not equals or argument.startswith("-") or not _SPECIAL.search(value) or value.startswith(("[", "{")):
+        return argument
+    text = setting(key, value)
+    is_text = os.path.exists(os.path.expanduser(value)) or (not _is_hydra(argument) and _is_hydra(text))
+    return text if is_text else argument
+
+
+def _is_hydra(argument: str) -> bool:
+    try:
+        OverridesParser.create().parse_override(argument)
+    except HydraException:
+        return False
+    return True
 
 
 def check_arguments(arguments: list[str]) -> None:

@@ -27,7 +27,7 @@ from mimic.base import compat, registry
 from mimic.base.config import BAD_INPUT, explain, schema, suggestion, typed
 from mimic.base.distribution import VERSION
 from mimic.base.files import read_text
-from mimic.commands.arguments import check_arguments, load_plugins
+from mimic.commands.arguments import check_arguments, load_plugins, quoted
 from mimic.commands.arm_keys import expand_arms
 from mimic.commands.config import (
     CollectConfig,
@@ -172,16 +172,17 @@ def _sweep_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
 
 
 def expand_arguments(arguments: Sequence[str], command: str) -> list[str]:
-    """Returns the arguments of a command in Hydra's syntax: its positional argument, and keys of arms.
+    """Returns the arguments of a command in Hydra's syntax: its positional argument, keys of arms, and texts in quotes.
 
     Raises:
       ValueError: see `expand_arms`.
     """
-    return expand_arms([_with_key(argument, command) for argument in arguments], command)
+    return list(map(quoted, expand_arms([_with_key(argument, command) for argument in arguments], command)))
 
 
 def _with_key(argument: str, command: str) -> str:
-    if command not in FIRST_KEY or "=" in argument or argument.startswith("-"):
+    is_setting = "=" in argument and not os.path.exists(argument)
+    if command not in FIRST_KEY or is_setting or argument.startswith("-"):
         return argument
     of_suffix = FIRST_KEY_OF_SUFFIX.get(command, {})
     return f"{of_suffix.get(Path(argument).suffix.lower(), FIRST_KEY[command])}={argument}"

@@ -59,6 +59,28 @@ def test_odd_command_lines(rejected, monkeypatch, arguments, message):
     assert message in error and "not-for-others" not in error and len(error) < 1100
 
 
+@pytest.mark.parametrize(
+    ("argument", "expected"),
+    [
+        ("out=run (1)", "out='run (1)'"),
+        ("source=motions [old].csv", "source='motions [old].csv'"),
+        ("source=a,b.csv", "source='a,b.csv'"),  # a file, and not two values of a sweep
+        ("source='a,b.csv'", "source='a,b.csv'"),
+        ("source=it's.csv", r"source='it\'s.csv'"),
+        ("seed=1,2", "seed=1,2"),
+        ("env.learner.locked=[3,4", "env.learner.locked=[3,4"),  # an error of Hydra
+        ("env.learner.home={a:1}", "env.learner.home={a:1}"),
+        ("--multirun", "--multirun"),
+    ],
+)
+def test_files_with_any_name_are_text(tmp_path, monkeypatch, argument, expected):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a,b.csv").touch()
+    assert cli.expand_arguments([argument], "train") == [expected]
+    (tmp_path / "a = (1).urdf").touch()
+    assert "learner.model='a = (1).urdf'" in cli.expand_arguments(["a = (1).urdf"], "inspect")
+
+
 def test_absurd_recordings(reason):
     steps = ["env.demonstrations.count=100000", "env.horizon=10000"]
     assert "physics steps to record, got 10,008,000,000" in reason("train", "env=panda4dof", *steps)
