@@ -1,35 +1,34 @@
-"""PPO of stable-baselines3 with its default settings on the tasks of mimic's runs, and the gaps of both.
+"""PPO of stable-baselines3 with its default settings in the paper's setting.
 
-    python -m benchmarks.stable_baselines --out FILE --runs RUN [RUN ...] [--steps 3000000] [--jobs N]
+    python -m benchmarks.stable_baselines --out FILE [--tasks NAME ...] [--steps 1000000] [--jobs N]
 
-RUN is a run directory of `python -m mimic.train`. Environment, motions, discount factor and seed are those of the run;
-everything else is what the package sets, as for the paper, which states no more. A batch has its 2,048 steps, of 64
+The tasks are the cases `paper_setting` of `benchmarks.study`: their environments, motions, discount factors and seeds.
+Everything else is what the package sets, as for the paper, which states no more. A batch has its 2,048 steps, of 64
 arms. The package is not a dependency of mimic: `pip install stable-baselines3`. It trains on one core a run.
 """
 
 import functools
-import json
 import multiprocessing
 import os
+import re
 import time
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from brax.envs.base import State
+from omegaconf import OmegaConf
 
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect
+from benchmarks.study import cases
+from mimic.envs.make import make
 from mimic.evaluation.evaluator import Controller, Evaluator
-from mimic.runs.files import REPORT
-from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo.trainer import run_environment
-from mimic.trainers.run_config import load_config
 
 ARMS, BATCH = 64, 2048
-COLUMNS = "env demonstrations seed steps:,.0f steps_per_s:,.0f gap[train]:.2% gap[held_out]:.2% mimic[held_out]:.2%"
+COLUMNS = "task env demonstrations seed steps:,.0f steps_per_s:,.0f gap[train]:.2% gap[held_out]:.2%"
+TASKS = {case.name.removesuffix("-paper"): case for case in cases("paper") if case.group == "paper_setting"}
 
 
 def mean_action(weights: dict[str, Any]) -> Controller:
@@ -44,8 +43,8 @@ def mean_action(weights: dict[str, Any]) -> Controller:
     return controller
 
 
-def learn(run: Path, steps: int) -> Row:
-    """Trains and evaluates the package on the task of a run."""
+def learn(run: tuple[str, int], steps: int) -> Row:
+    """Trains and evaluates the package on a task, with a seed."""
     jax.config.update("jax_platforms", "cpu")
     import torch  # pyright: ignore[reportMissingImports]
     from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
@@ -54,33 +53,34 @@ def learn(run: Path, steps: int) -> Row:
     from mimic.gymnasium import VectorEnv
 
     torch.set_num_threads(1)
-    config, report = load_config(run), json.loads((run / REPORT).read_text())
-    env, held_out = run_environment(config.env, run)
+    task, seed = run
+    settings = OmegaConf.from_dotlist([re.sub("^env=", "env.name=", argument) for argument in TASKS[task].arguments])
+    env = make(metric=settings.metric, **OmegaConf.to_container(settings.env))
+    assert env.held_out is not None
     options = {
         "n_steps": BATCH // ARMS,
-        "gamma": cast(PPOConfig, config.trainer).discounting,
-        "seed": config.seed,
+        "gamma": settings.trainer.discounting,
+        "seed": seed,
         "device": "cpu",
     }
     began = time.perf_counter()
     model = PPO("MlpPolicy", Arms(VectorEnv(env, num_envs=ARMS)), **options).learn(steps)
     rate = model.num_timesteps / (time.perf_counter() - began)
     weights = {name: jnp.asarray(value.numpy()) for name, value in model.policy.state_dict().items()}
-    evaluator = Evaluator(env, held_out)
+    evaluator = Evaluator(env, env.held_out)
     summary = evaluator.summary(jax.jit(lambda: evaluator.rollout(mean_action(weights)))())
-    task = {"env": config.env.name, "demonstrations": env.demonstrations.count, "seed": config.seed}
-    speed = {"steps": model.num_timesteps, "steps_per_s": round(rate)}
-    return {**task, **speed, "gap": summary["optimality_gap"], "mimic": report["optimality_gap"]}
+    named = {"task": task, "env": env.config.name, "demonstrations": env.demonstrations.count, "seed": seed}
+    return {**named, "steps": model.num_timesteps, "steps_per_s": round(rate), "gap": summary["optimality_gap"]}
 
 
 def main() -> None:
-    parser = make_parser("stable_baselines", __doc__, steps=3_000_000, jobs=os.cpu_count() or 1)
-    parser.add_argument("--runs", nargs="+", type=Path, required=True, metavar="RUN")
+    parser = make_parser("stable_baselines", __doc__, tasks=TASKS, steps=1_000_000, jobs=os.cpu_count() or 1)
     options = parser.parse_args()
+    runs = [(task, seed) for seed in range(TASKS[options.tasks[0]].seeds) for task in options.tasks]
 
     def rows() -> Iterator[Row]:
-        with multiprocessing.get_context("spawn").Pool(min(options.jobs, len(options.runs))) as pool:
-            yield from pool.imap(functools.partial(learn, steps=options.steps), options.runs)
+        with multiprocessing.get_context("spawn").Pool(min(options.jobs, len(runs))) as pool:
+            yield from pool.imap(functools.partial(learn, steps=options.steps), runs)
 
     collect(options, rows(), "rows", COLUMNS)
 
