@@ -13,7 +13,7 @@ import os
 import re
 import time
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +55,8 @@ def learn(run: tuple[str, int], steps: int) -> Row:
     torch.set_num_threads(1)
     task, seed = run
     settings = OmegaConf.from_dotlist([re.sub("^env=", "env.name=", argument) for argument in TASKS[task].arguments])
-    env = make(metric=settings.metric, **OmegaConf.to_container(settings.env))
+    fields = cast(dict[str, Any], OmegaConf.to_container(settings.env))
+    env = make(fields.pop("name"), metric=settings.metric, **fields)
     assert env.held_out is not None
     options = {
         "n_steps": BATCH // ARMS,
