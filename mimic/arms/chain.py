@@ -220,8 +220,7 @@ def _moved(link: Link, rotation: np.ndarray, offset: np.ndarray, joint: int) -> 
     def move(point: np.ndarray) -> np.ndarray:
         return rotation @ point + offset
 
-    merged = tuple((move(start), move(end)) for start, end in link.merged)
-    return dataclasses.replace(link, start=move(link.start), end=move(link.end), joint=joint, merged=merged)
+    return dataclasses.replace(link, start=move(link.start), end=move(link.end), joint=joint)
 
 
 def _moved_hand(hand: Hand, rotation: np.ndarray, offset: np.ndarray, joint: int) -> Hand:
