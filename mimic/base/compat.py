@@ -10,14 +10,17 @@ import logging
 import os
 import pkgutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 _log = logging.getLogger(__name__)
 _BRAX_AXIS_NAME = "i"  # brax.training.agents.ppo.train
 # What PyOpenGL and ctypes raise where a graphics library is missing.
 NO_GRAPHICS = (AttributeError, OSError, ctypes.ArgumentError)
+_RESULTS = 15  # of one kernel: XLA computes anew what more of them have in common
 _SLOW_CPU_FLAG = "--xla_cpu_use_fusion_emitters=false"
 
 
@@ -145,42 +148,31 @@ def is_cpu() -> bool:
     return jax.default_backend() == "cpu"
 
 
-def stored(index: Any, function: Callable[[Any], Any], argument: Any) -> Any:
-    """Returns function(argument), stored in memory between two parts of a loop's body on a CPU.
+def stored(tree: Any) -> Any:
+    """The values of a pytree of arrays and Python numbers, which XLA's CPU backend computes together and stores.
 
-    XLA's CPU backend fuses without this the whole body of a loop into each of its results and computes what they have
-    in common once for each: a Newton step 5 times, its sines 30 times. It removes `jax.lax.optimization_barrier` before
-    it fuses, but not a conditional. GPUs, where a conditional costs more, do without.
-
-    A kernel of this backend has one result, so pairs of real numbers are stored as complex ones: half the kernels, and
-    half the computation that they repeat.
+    A kernel of this backend has one result, except for that of a reduction of several arrays. So without this it
+    computes what several results have in common once for each: in a Newton step its sines 30 times. Here each array is
+    repeated along a new axis and reduced to its last entry; LLVM sees that the entries are equal. Pairs of real numbers
+    are one complex one, because few results fit into a kernel. Other backends do without.
 
     Args:
-      index: of the loop, from 0 on; the same in a whole batch. Not constants: XLA would see that they are not negative.
-      function: from a pytree of arrays to a pytree of arrays and Python numbers.
-      argument: of the function.
+      tree: its arrays have real numbers, and shapes that broadcast; all results have the same shape.
     """
     import jax
 
-    if not is_cpu():
-        return function(argument)
-    result: Any = None  # that of the trace: its Python numbers, and the types of its arrays
-    stored_types: list[Any] | None = None
-
-    def arrays_of(argument: Any) -> list[Any]:
-        nonlocal result, stored_types
-        value = function(argument)
-        result = jax.tree.map(lambda x: x if _is_number(x) else jax.ShapeDtypeStruct(x.shape, x.dtype), value)
-        arrays = _in_pairs([leaf for leaf in jax.tree.leaves(value) if not _is_number(leaf)])
-        stored_types = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays]
-        return arrays
-
-    def never(argument: Any) -> list[Any]:
-        types = stored_types or jax.eval_shape(arrays_of, argument)
-        return [jax.numpy.zeros(x.shape, x.dtype) for x in types]
-
-    arrays = iter(_from_pairs(jax.lax.cond(index >= 0, arrays_of, never, argument)))
-    return jax.tree.map(lambda x: x if _is_number(x) else next(arrays), result)
+    leaves, structure = jax.tree.flatten(tree)
+    arrays = [x for x in leaves if not _is_number(x)]
+    if not is_cpu() or not arrays:
+        return tree
+    shape = jax.numpy.broadcast_shapes(*(x.shape for x in arrays))
+    arrays = _in_pairs([jax.numpy.broadcast_to(x, shape) for x in arrays])
+    last: list[Any] = []
+    for group in (arrays[i : i + _RESULTS] for i in range(0, len(arrays), _RESULTS)):
+        twice = [jax.numpy.broadcast_to(x, (2, *shape)) for x in group]
+        last += jax.lax.reduce(twice, [np.zeros((), x.dtype) for x in group], lambda _, entry: entry, (0,))
+    results = iter(_from_pairs(last))
+    return jax.tree.unflatten(structure, [x if _is_number(x) else next(results) for x in leaves])
 
 
 def _in_pairs(arrays: list[Any]) -> list[Any]:

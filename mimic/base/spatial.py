@@ -57,7 +57,8 @@ def times(x: Scalar, y: Scalar) -> Scalar:
                 return 0.0
             if abs(constant) == 1:
                 return other if constant > 0 else -other
-    return lax.mul(x, y) if _are_alike(x, y) else x * y
+    operands = _lax_operands(x, y)
+    return lax.mul(*operands) if operands else x * y
 
 
 def plus(x: Scalar, y: Scalar) -> Scalar:
@@ -66,7 +67,8 @@ def plus(x: Scalar, y: Scalar) -> Scalar:
         return y
     if isinstance(y, float) and y == 0:
         return x
-    return lax.add(x, y) if _are_alike(x, y) else x + y
+    operands = _lax_operands(x, y)
+    return lax.add(*operands) if operands else x + y
 
 
 def minus(x: Scalar, y: Scalar) -> Scalar:
@@ -75,14 +77,19 @@ def minus(x: Scalar, y: Scalar) -> Scalar:
         return times(-1.0, y)
     if isinstance(y, float) and y == 0:
         return x
-    return lax.sub(x, y) if _are_alike(x, y) else x - y
+    operands = _lax_operands(x, y)
+    return lax.sub(*operands) if operands else x - y
 
 
-def _are_alike(x: Scalar, y: Scalar) -> bool:
-    """Whether both are traced with one shape and type, so that operations of `jax.lax` apply: they trace faster."""
-    if not (isinstance(x, Tracer) and isinstance(y, Tracer)):
-        return False
-    return x.aval.shape == y.aval.shape and x.aval.dtype == y.aval.dtype  # type: ignore[attr-defined]
+def _lax_operands(x: Scalar, y: Scalar) -> tuple[Scalar, Scalar] | None:
+    """Operands for `jax.lax`, which traces faster, where they are like tracers, or a tracer and a float; else None."""
+    if isinstance(x, Tracer) and isinstance(y, Tracer):
+        return (x, y) if x.aval.shape == y.aval.shape and x.aval.dtype == y.aval.dtype else None  # type: ignore[attr-defined]
+    tracer, number = (x, y) if isinstance(x, Tracer) else (y, x)
+    if not (isinstance(tracer, Tracer) and isinstance(number, float)) or tracer.dtype.kind != "f" or tracer.weak_type:
+        return None
+    number = tracer.dtype.type(number)
+    return (tracer, number) if tracer is x else (number, tracer)
 
 
 def add(a: Vector, b: Vector) -> Vector:
@@ -171,7 +178,8 @@ def axis_rotation(axis: Vector, angle: Scalar) -> Rotation:
 
 def stack_batches(vectors: Sequence[Vector], batch: Float[Array, " n"]) -> Float[Array, "vectors 3 n"]:
     """One array of vectors whose components are numbers or batches with the shape and type of `batch`."""
-    scalars = compat.computed_once([jnp.zeros_like(batch) + x for vector in vectors for x in vector])
+    scalars = [x for vector in vectors for x in vector]
+    scalars = compat.computed_once([x if jnp.shape(x) == batch.shape else jnp.full_like(batch, x) for x in scalars])
     return jnp.stack([jnp.stack(scalars[i : i + 3]) for i in range(0, len(scalars), 3)])
 
 

@@ -15,7 +15,7 @@ from mimic.base.ranges import check_ranges, number
 from mimic.metric.capsule_distances import capsule_axes, intrusion, pair_distances
 from mimic.metric.kinematics import LinkStates, joint_frames
 from mimic.retargeting.closed_form import SMOOTHING, Smoothing
-from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
+from mimic.retargeting.optimizers import Derivatives, Scalars
 from mimic.retargeting.pose_objective import PoseObjective, Target, automatic_derivatives
 
 _NEAR_LIMIT = 0.1  # fraction of a joint's range at each end where `limits` counts
@@ -159,8 +159,8 @@ def with_costs(
     def value(target: Target, states: LinkStates) -> Array:  # of initial guesses, so without the costs
         return objective.value(target[0], states)
 
-    def total(target: Target, qpos: Scalars, store: Store = call, smoothing: Smoothing = SMOOTHING) -> Derivatives:
-        base = objective.derivatives(target[0], qpos, store, smoothing)
+    def total(target: Target, qpos: Scalars, smoothing: Smoothing = SMOOTHING) -> Derivatives:
+        base = objective.derivatives(target[0], qpos, smoothing)
         cost = automatic_derivatives(lambda q: pose_cost(costs, expert, learner, capsules, target[1], q), qpos)
         return sum_of(base, cost)
 

@@ -36,7 +36,7 @@ from mimic.retargeting.hand_target import (
 )
 from mimic.retargeting.initial_guesses import RandomPoses
 from mimic.retargeting.multistart import Descents, kept_descents
-from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call, newton
+from mimic.retargeting.optimizers import Derivatives, Scalars, newton
 from mimic.retargeting.pose_objective import PoseObjective, Target, pose_objective
 
 
@@ -108,11 +108,11 @@ class ExactSolver(NamedTuple):
         """Derivatives for joint angles [lanes, poses], of a `Stage` given as `smoothing`."""
         of_metric = self.objective.of_batch(targets.metric)
 
-        def weighted(qpos: Scalars, store: Store = call, smoothing: Any = FINE) -> Derivatives:
+        def weighted(qpos: Scalars, smoothing: Any = FINE) -> Derivatives:
             stage = smoothing
-            metric = jax.tree.map(lambda x: stage.metric * x, of_metric(qpos, store, stage.smoothing))
+            metric = jax.tree.map(lambda x: stage.metric * x, of_metric(qpos, stage.smoothing))
             return sum_of(
-                hand_cost_derivatives(self.learner, self.pairs[:, 1], targets.hands, qpos, stage.rotation, store),
+                hand_cost_derivatives(self.learner, self.pairs[:, 1], targets.hands, qpos, stage.rotation),
                 metric,
             )
 
@@ -134,8 +134,8 @@ class ExactSolver(NamedTuple):
             exact = is_exact(*self.errors(targets, qpos))
             rotation = jnp.where(exact, 1, weight).astype(qpos.dtype)
 
-            def derivatives(qpos: Scalars, store: Store) -> Derivatives:
-                return hand_cost_derivatives(self.learner, chosen, targets.hands, qpos, rotation, store)
+            def derivatives(qpos: Scalars) -> Derivatives:
+                return hand_cost_derivatives(self.learner, chosen, targets.hands, qpos, rotation)
 
             def run(qpos: Array) -> Array:
                 start = qpos + jnp.where(exact, 0, kick) * pattern

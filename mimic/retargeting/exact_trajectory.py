@@ -33,7 +33,7 @@ from mimic.retargeting.hand_target import (
     placed_hands,
 )
 from mimic.retargeting.initial_guesses import RandomPoses
-from mimic.retargeting.optimizers import Derivatives, Scalars, Store, newton
+from mimic.retargeting.optimizers import Derivatives, Scalars, newton
 from mimic.retargeting.path_smoothing import smoothed
 from mimic.retargeting.pose import wrap_angles
 from mimic.retargeting.self_motions import past_failing_times
@@ -221,8 +221,8 @@ def _follower(*arms: Any) -> Callable[..., Array]:
             leaps = jnp.any(jnp.abs(goal - last) > _LEAP * jump)
             weight = jnp.where(exact, 1, _POSITION_FIRST).astype(last.dtype)
 
-            def derivatives(qpos: Scalars, store: Store) -> Derivatives:
-                return hand_cost_derivatives(solver.learner, solver.pairs[:, 1], target.hands, qpos, weight, store)
+            def derivatives(qpos: Scalars) -> Derivatives:
+                return hand_cost_derivatives(solver.learner, solver.pairs[:, 1], target.hands, qpos, weight)
 
             goal = jnp.clip(goal, last - jump, last + jump)
             starts = last[:, None] + (goal - last)[:, None] * np.array(_FRACTIONS, last.dtype)

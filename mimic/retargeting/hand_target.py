@@ -14,9 +14,10 @@ from jaxtyping import Array, Bool, Float
 from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment, in_chain_lengths
 from mimic.base import spatial
+from mimic.base.compat import stored
 from mimic.base.spatial import Rotation, Scalar, Vector
 from mimic.metric.kinematics import JointFrame, LinkStates, hand_vectors, joint_axes, joint_frames
-from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
+from mimic.retargeting.optimizers import Derivatives, Scalars
 
 POSITION_TOLERANCE = 1e-4  # m
 ROTATION_TOLERANCE = float(np.deg2rad(0.01))  # rad
@@ -160,7 +161,7 @@ class _HandTerms(NamedTuple):
 
 
 def hand_cost_derivatives(
-    learner: Embodiment, chosen: Any, target: HandTarget, qpos: Scalars, rotation_weight: Scalar, store: Store = call
+    learner: Embodiment, chosen: Any, target: HandTarget, qpos: Scalars, rotation_weight: Scalar
 ) -> Derivatives:
     """Derivatives of the cost of the hands.
 
@@ -170,33 +171,22 @@ def hand_cost_derivatives(
       target: their poses, whose batch axes broadcast with those of the joint angles.
       qpos: joint angles [rad].
       rotation_weight: r.
-      store: see `mimic.retargeting.optimizers.Store`.
     """
     arm, unit, joints = in_chain_lengths(learner), 1 / spatial.scalar(learner.chain_length), learner.num_joints
     lines = [joint_line(arm, arm.hand_joint[hand]) for hand in chosen]
-
-    def kinematics(qpos: Scalars) -> tuple[list[Vector], list[Vector], list[tuple[Vector, Rotation]]]:
-        frames = joint_frames(arm, qpos, None)
-        return joint_axes(arm, frames), [frame.anchor for frame in frames[1:]], hand_components(arm, frames)
-
-    def terms(of_pose: Any) -> list[_HandTerms]:
-        axes, anchors, vectors = of_pose
-        of_hands = []
-        for number, (hand, line) in enumerate(zip(chosen, lines, strict=True)):
-            goal = spatial.scale(unit, spatial.vector(target.position[number])), spatial.rotation(target.axes[number])
-            arms = [axes[joint] for joint in line], [anchors[joint] for joint in line]
-            of_hands.append(_hand_terms(*arms, vectors[hand], goal, rotation_weight))
-        return jax.tree.map(spread, of_hands)
-
-    lanes = jnp.broadcast_shapes(np.shape(qpos[0]), target.position.shape[2:])
-
-    def spread(x: Scalar) -> Scalar:  # where joints do not change a number it has the shape of the target
-        return x if isinstance(x, float | int) or x.shape == lanes else jnp.broadcast_to(x, lanes)
-
+    frames = joint_frames(arm, qpos, None)
+    axes, anchors, vectors = stored(
+        (joint_axes(arm, frames), [frame.anchor for frame in frames[1:]], hand_components(arm, frames))
+    )
+    of_hands = []
+    for number, (hand, line) in enumerate(zip(chosen, lines, strict=True)):
+        goal = spatial.scale(unit, spatial.vector(target.position[number])), spatial.rotation(target.axes[number])
+        of_line = [axes[joint] for joint in line], [anchors[joint] for joint in line]
+        of_hands.append(_hand_terms(*of_line, vectors[hand], goal, rotation_weight))
     value: Any = 0.0
     gradient: list[Any] = [0.0] * joints
     hessian: list[list[Any]] = [[0.0] * (j + 1) for j in range(joints)]
-    for line, of_hand in zip(lines, store(terms, store(kinematics, tuple(qpos))), strict=True):
+    for line, of_hand in zip(lines, stored(of_hands), strict=True):
         value = spatial.plus(value, of_hand.value)
         for place, j in enumerate(line):
             velocity, axis = of_hand.velocities[place], of_hand.axes[place]

@@ -32,7 +32,7 @@ from mimic.retargeting.optimizers import (
 Method = Literal["newton", "gradient_descent"]
 _ROUGH_FRACTION = 0.35  # of the iterations, for descents from all initial guesses; the best ones get the others
 
-# Derivatives at joint angles, with a `Store` and `smoothing`; see `PoseObjective.derivatives`.
+# Derivatives at joint angles, with `smoothing`; see `PoseObjective.derivatives`.
 SmoothedObjective = Callable[..., Derivatives]
 
 
@@ -151,18 +151,14 @@ def _descend_in_one_loop(
         guess = jax.lax.dynamic_index_in_dim(rounds, step.round, keepdims=False)
         return newton_start(jnp.where(step.is_last, best.qpos, guess), limits), best
 
-    def iterate(
-        carry: tuple[NewtonState, Solution], index_and_step: tuple[Array, _Step]
-    ) -> tuple[tuple[NewtonState, Solution], None]:
-        index, step = index_and_step
+    def iterate(carry: tuple[NewtonState, Solution], step: _Step) -> tuple[tuple[NewtonState, Solution], None]:
         state, best = jax.lax.cond(step.begins, begin, lambda carry, _: carry, carry, step)
         of_step = functools.partial(objective, smoothing=step.smoothing)
-        return (newton_step(of_step, state, limits, index), best), None
+        return (newton_step(of_step, state, limits), best), None
 
     unknown = newton_start(rounds[0], limits)
     steps = jax.tree.map(jnp.asarray, _schedule(len(rounds), descents, settings, rounds.dtype))
-    indices = jnp.arange(len(steps.begins))
-    (state, _), _ = jax.lax.scan(iterate, (unknown, solution_at(unknown, limits)), (indices, steps))
+    (state, _), _ = jax.lax.scan(iterate, (unknown, solution_at(unknown, limits)), steps)
     return solution_at(state, limits)
 
 

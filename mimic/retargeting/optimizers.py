@@ -4,7 +4,6 @@ They compute on scalar components (see `mimic.base.spatial`), so that a batch of
 are the last axes of the start, and the objective gets joint angles of the shape of the lanes.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mimic.base import compat
+from mimic.base.compat import stored
 from mimic.base.spatial import Scalar, minus, plus, times
 
 _MAX_STEP = 1.0  # rad, of a joint in one Newton step
@@ -54,15 +53,7 @@ class Solution(NamedTuple):
     gradient_norm: Float[Array, "*lanes"]
 
 
-# Derivatives at joint angles. The second argument is a `Store`.
-Objective = Callable[..., Derivatives]
-# Calls a function with one argument; its result may be stored in memory, so that it is computed once.
-Store = Callable[[Callable[[Any], Any], Any], Any]
-
-
-def call(function: Callable[[Any], Any], argument: Any) -> Any:
-    """The `Store` that stores nothing."""
-    return function(argument)
+Objective = Callable[[Scalars], Derivatives]  # derivatives at joint angles
 
 
 class NewtonState(NamedTuple):
@@ -88,10 +79,10 @@ def newton(
 ) -> Solution:
     """Damped Newton descent with the exact second derivative and negative curvature flipped (saddle-free Newton)."""
 
-    def iterate(state: NewtonState, index: Array) -> tuple[NewtonState, None]:
-        return newton_step(objective, state, limits, index), None
+    def iterate(state: NewtonState, _: None) -> tuple[NewtonState, None]:
+        return newton_step(objective, state, limits), None
 
-    state, _ = jax.lax.scan(iterate, newton_start(start, limits, damping), jnp.arange(iterations + 1))
+    state, _ = jax.lax.scan(iterate, newton_start(start, limits, damping), None, length=iterations + 1)
     return solution_at(state, limits)
 
 
@@ -103,26 +94,24 @@ def newton_start(start: Float[Array, "joints *lanes"], limits: Limits, damping: 
     return NewtonState(_within(list(start), _bounds(limits, joints)), unevaluated, zero + damping / _LESS)
 
 
-def newton_step(objective: Objective, state: NewtonState, limits: Limits, index: Any) -> NewtonState:
+def newton_step(objective: Objective, state: NewtonState, limits: Limits) -> NewtonState:
     """One step, which is undone where the objective does not get smaller.
 
     Args:
       objective: to minimise.
       state: before the step.
       limits: of the joints [rad].
-      index: of a loop, for `mimic.base.compat.stored`.
     """
     qpos, here, damping = state
     bounds = _bounds(limits, len(qpos))
-    store = functools.partial(compat.stored, index)
     free = _free(qpos, here.gradient, bounds)
     step = _descent_step(here, free, damping)
     scale = 1 / jnp.maximum(_max_abs(step) / _MAX_STEP, 1.0)
-    new_qpos = _within([q + s * scale for q, s in zip(qpos, step, strict=True)], bounds)
-    there = store(lambda qpos: _symmetric(objective(qpos, store)), new_qpos)
+    new_qpos = stored(_within([q + s * scale for q, s in zip(qpos, step, strict=True)], bounds))
+    there = _symmetric(objective(new_qpos))
     better = there.value < here.value
-    best_qpos, best = jax.tree.map(functools.partial(jnp.where, better), (new_qpos, there), (qpos, here))
-    return NewtonState(best_qpos, best, damping * jnp.where(better, _LESS, _MORE))
+    best_qpos, best = jax.tree.map(lambda new, old: jnp.where(better, new, old), (new_qpos, there), (qpos, here))
+    return stored(NewtonState(best_qpos, best, damping * jnp.where(better, _LESS, _MORE)))
 
 
 def gradient_descent(
@@ -148,17 +137,16 @@ def _descent_step(here: Derivatives, free: Scalars, damping: Scalar) -> Scalars:
     for i in range(joints):
         matrix[i][i] = plus(matrix[i][i] + damping * jnp.maximum(jnp.abs(matrix[i][i]), 0.01), 1.0 - free[i])
     step = [times(free[i], -here.gradient[i] * unit) for i in range(joints)]
-    pivots = []
+    inverses = []  # of the pivots: quotients would be kernels of their own
     for k in range(joints):
-        pivot = jnp.where(jnp.abs(matrix[k][k]) < eps, eps, matrix[k][k])
+        inverses.append(1 / jnp.where(jnp.abs(matrix[k][k]) < eps, eps, matrix[k][k]))
         below = [matrix[i][k] for i in range(joints) if i > k]
         for i in range(k + 1, joints):
-            matrix[i][k] = matrix[i][k] / pivot  # from now on an entry of L
+            matrix[i][k] = times(matrix[i][k], inverses[k])  # from now on an entry of L
             step[i] = minus(step[i], times(matrix[i][k], step[k]))
             for j in range(k + 1, i + 1):
                 matrix[i][j] = minus(matrix[i][j], times(matrix[i][k], below[j - k - 1]))
-        pivots.append(jnp.abs(pivot))
-    step = [s / pivot for s, pivot in zip(step, pivots, strict=True)]
+    step = [times(s, jnp.abs(inverse)) for s, inverse in zip(step, inverses, strict=True)]
     for k in reversed(range(joints)):
         for i in range(k + 1, joints):
             step[k] = minus(step[k], times(matrix[i][k], step[i]))

@@ -13,7 +13,7 @@ from mimic.base.compilation import compiled_once
 from mimic.retargeting.exact_chunks import by_chunks
 from mimic.retargeting.exact_pose import exact_solver
 from mimic.retargeting.hand_target import Placement, hand_cost_derivatives, is_exact
-from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call, newton
+from mimic.retargeting.optimizers import Derivatives, Scalars, newton
 
 _ROUNDS, _WINDOW = 6, 10.0  # and times over which postures are smoothed
 _ON_TARGET = 1e4  # weight of the hand's cost, of that of changes
@@ -104,13 +104,13 @@ def _back_to_the_hand(*arms: Any) -> Callable[..., tuple[Array, ...]]:
     def back(poses: Array, base: Placement, qpos: Array) -> tuple[Array, ...]:
         targets, _ = solver.targets(base, poses)
 
-        def derivatives(qpos: Scalars, store: Store) -> Derivatives:
-            return hand_cost_derivatives(solver.learner, solver.pairs[:, 1], targets.hands, qpos, 1.0, store)
+        def derivatives(qpos: Scalars) -> Derivatives:
+            return hand_cost_derivatives(solver.learner, solver.pairs[:, 1], targets.hands, qpos, 1.0)
 
         begin = qpos.astype(poses.dtype).T
         lanes = newton(derivatives, begin, limits, _STEPS, _DAMPING).qpos
         was, now = (is_exact(*(x[0] for x in solver.errors(targets, qpos[:, None]))) for qpos in (begin, lanes))
-        lower, joints = derivatives([*lanes], call).hessian, range(len(lanes))
+        lower, joints = derivatives([*lanes]).hessian, range(len(lanes))
         rows = [[lower[max(i, j)][min(i, j)] + jnp.zeros_like(lanes[0]) for j in joints] for i in joints]
         return lanes.T, was, now, jnp.moveaxis(jnp.stack([jnp.stack(row) for row in rows]), -1, 0)
 

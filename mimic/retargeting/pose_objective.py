@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Int
 from mimic.arms.arrays import ArmArrays
 from mimic.arms.embodiment import Embodiment, in_chain_lengths
 from mimic.base import spatial
+from mimic.base.compat import stored
 from mimic.base.spatial import Rotation, Vector, array_library
 from mimic.metric.distance import PARTS, DistanceWeights, Metric, RotationMeasure
 from mimic.metric.kinematics import (
@@ -40,7 +41,7 @@ from mimic.retargeting.closed_form import (
     static_derivatives,
     total,
 )
-from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
+from mimic.retargeting.optimizers import Derivatives, Scalars
 
 Target = Any  # pytree: the data of the expert's pose that the objective needs
 
@@ -53,9 +54,8 @@ class PoseObjective:
       distance: (expert's link states, learner's link states) -> embodiment distance, both at rest.
       target: (expert's link states, expert's pose) -> target.
       value: (target, learner's link states) -> distance with smoothed lengths and angles.
-      derivatives: (target, joint angles, store, smoothing) -> derivatives of the distance; the value up to a constant
-        of the target. `store`, a `mimic.retargeting.optimizers.Store`, and `smoothing`, a
-        `mimic.retargeting.closed_form.Smoothing`, may be omitted.
+      derivatives: (target, joint angles, smoothing) -> derivatives of the distance; the value up to a constant of the
+        target. `smoothing`, a `mimic.retargeting.closed_form.Smoothing`, may be omitted.
       is_elementwise: whether `derivatives` also takes arrays of poses for each joint, which broadcast with arrays of
         targets; see `of_batch`.
     """
@@ -75,9 +75,9 @@ class PoseObjective:
         if self.is_elementwise:
             return functools.partial(self.derivatives, targets)
 
-        def derivatives(qpos: Scalars, store: Store = call, smoothing: Smoothing = SMOOTHING) -> Derivatives:
+        def derivatives(qpos: Scalars, smoothing: Smoothing = SMOOTHING) -> Derivatives:
             def at(target: Target, qpos: Scalars) -> Derivatives:
-                return self.derivatives(target, qpos, store, smoothing)
+                return self.derivatives(target, qpos, smoothing)
 
             return jax.vmap(jax.vmap(at, (None, 0)), (-1, -1), -1)(targets, tuple(qpos))
 
@@ -99,7 +99,7 @@ def pose_objective(
 
 
 def _differentiated(learner: Embodiment | ArmArrays, metric: Metric) -> PoseObjective:
-    def derivatives(target: LinkStates, qpos: Scalars, store: Store = call, smoothing: Any = None) -> Derivatives:
+    def derivatives(target: LinkStates, qpos: Scalars, smoothing: Any = None) -> Derivatives:
         return automatic_derivatives(lambda q: metric(target, link_states(learner, q)), qpos)
 
     return PoseObjective(metric, lambda states, _=None: states, metric, derivatives)
@@ -209,10 +209,8 @@ def _of_constant(
         vectors = [(row.direction, row.position) for row in rows]
         return joint_axes(arm, frames), [frame.anchor for frame in frames[1:]], vectors
 
-    def derivatives(
-        target: StaticTarget, qpos: Scalars, store: Store = call, smoothing: Smoothing = SMOOTHING
-    ) -> Derivatives:
-        axes, anchors, vectors = store(kinematics, tuple(qpos))
+    def derivatives(target: StaticTarget, qpos: Scalars, smoothing: Smoothing = SMOOTHING) -> Derivatives:
+        axes, anchors, vectors = stored(kinematics(qpos))
         rows = [Body(joint, *vector) for joint, vector in zip(joints, vectors, strict=True)]
         pulls = [_pull(target, directed == row, pairs[:, 1] == row) for row in range(len(rows))]
         return static_derivatives(axes, anchors, rows, pulls, arm.joint_parent, smoothing, rotation=rotation)
@@ -225,8 +223,8 @@ def _of_data(
 ) -> Callable[..., Derivatives]:
     """The derivatives for an arm as data: links and pairs are rows of arrays, and the links' joints may be traced.
 
-    On two cores a Panda's pose takes twice the time of that of a constant arm, and a batch six times; it compiles as
-    long, once for all arms.
+    On two cores a Panda's pose takes four times the time of that of a constant arm, and a batch 13 times; it compiles
+    three times as long, once for all arms.
     """
     arm, joints = learner.in_chain_lengths(), learner.num_joints
     row_joint, row_position, row_direction = (
@@ -240,16 +238,14 @@ def _of_data(
         x = jnp.moveaxis(frames[jnp.asarray(row_joint)[links] + 1], 1, 0)
         return (tuple(x[:3]), tuple(x[3:6]), tuple(x[6:9])), tuple(x[9:12]), columns(jnp.asarray(vectors)[links])  # type: ignore[return-value]
 
-    def derivatives(
-        target: StaticTarget, qpos: Scalars, store: Store = call, smoothing: Smoothing = SMOOTHING
-    ) -> Derivatives:
+    def derivatives(target: StaticTarget, qpos: Scalars, smoothing: Smoothing = SMOOTHING) -> Derivatives:
         lanes = jnp.broadcast_shapes(*(jnp.shape(q) for q in qpos), target.points.shape[2:])
         dtype = target.points.dtype
 
         def kinematics(qpos: Scalars) -> list[tuple[Rotation, Vector]]:
             return [(frame.rotation, frame.anchor) for frame in joint_frames(arm.astype(dtype), qpos, None)]
 
-        frames = store(kinematics, tuple(qpos))
+        frames = stored(kinematics(qpos))
         table = jnp.stack(
             [
                 jnp.stack([jnp.broadcast_to(jnp.asarray(x, dtype), lanes) for x in jax.tree.leaves(frame)])
@@ -268,8 +264,8 @@ def _of_data(
             rotation_of_link, _, direction = of_rows(table, directed, row_direction)
             return spatial.rotate(rotation_of_link, direction)
 
-        of_pairs = add_position(Load(), store(position_of_pairs, table), positions, smoothing.length)
-        of_links = add_directions(Load(), store(direction_of_links, table), directions, rotation, smoothing.angle)
+        of_pairs = add_position(Load(), stored(position_of_pairs(table)), positions, smoothing.length)
+        of_links = add_directions(Load(), stored(direction_of_links(table)), directions, rotation, smoothing.angle)
         loads = [
             total(*both)
             for both in zip(

@@ -24,7 +24,7 @@ from mimic.retargeting.exact_pose import SET
 from mimic.retargeting.exact_trajectory import exact_trajectories
 from mimic.retargeting.hand_target import HandError, placement
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
-from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, Store, newton
+from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, newton
 from mimic.retargeting.pose import (
     FLAT,
     ITERATIONS,
@@ -249,7 +249,7 @@ class _Tracker:
         reachable = jnp.maximum(lower, previous - self.jump), jnp.minimum(upper, previous + self.jump)
         of_pose = self._at(derivatives, time)
 
-        def of_motion(qpos: Scalars, store: Store) -> Derivatives:
-            return sum_of(of_pose(qpos, store), smoothness_derivatives(self.costs, qpos, previous, earlier))
+        def of_motion(qpos: Scalars) -> Derivatives:
+            return sum_of(of_pose(qpos), smoothness_derivatives(self.costs, qpos, previous, earlier))
 
         return newton(of_motion if self.costs.of_motion else of_pose, guess, reachable, iterations)

@@ -42,28 +42,21 @@ def test_the_cpu_flag_is_for_old_jax_alone(version, needed):
     assert compat.needs_cpu_flag(version) is needed
 
 
-@pytest.mark.parametrize("count", [2, 3])
-def test_stored_values_are_those_of_the_function_in_half_as_many_arrays(count):
-    """Pairs become complex numbers, because a kernel of XLA's CPU backend has one result."""
+@pytest.mark.parametrize("count", [2, 3, 31])
+def test_stored_values_are_computed_in_a_kernel_for_each_thirty(count):
+    """Pairs become complex numbers, and a reduction of 15 of these is one kernel of XLA's CPU backend."""
 
-    def parts(x):
-        return {"arrays": [x + k for k in range(count)], "number": 2.0}
+    def results(x):
+        root = x + 1
+        return {"arrays": [k * jnp.ones(3)[:, None] * root for k in range(count)], "number": 2.0}
 
-    def loop(x):
-        def step(total, index):
-            result = compat.stored(index, parts, total)
-            assert result["number"] == 2.0
-            return sum(result["arrays"]), None
-
-        return jax.lax.scan(step, x, jnp.arange(3))[0]
+    def total(x):
+        result = compat.stored(results(x))
+        assert result["number"] == 2.0
+        return sum(result["arrays"])
 
     x = jnp.array([0.5, -1.0])
-    expected = x
-    for _ in range(3):
-        expected = sum(parts(expected)["arrays"])
-    np.testing.assert_allclose(loop(x), expected)
-    gradient = jax.grad(lambda x: jnp.sum(loop(x)))(x)
-    np.testing.assert_allclose(gradient, count**3)
-    (scan,) = [e for e in jax.make_jaxpr(loop)(x).eqns if e.primitive.name == "scan"]
-    (cond,) = [e for e in scan.params["jaxpr"].jaxpr.eqns if e.primitive.name == "cond"]
-    assert len(cond.outvars) == (count + 1) // 2
+    np.testing.assert_allclose(total(x), sum(results(x)["arrays"]))
+    np.testing.assert_allclose(jax.grad(lambda x: jnp.sum(total(x)))(x), 3 * count * (count - 1) / 2)
+    reductions = [e for e in jax.make_jaxpr(total)(x).eqns if e.primitive.name == "reduce"]
+    assert [len(e.outvars) for e in reductions] == ([15, 1] if count == 31 else [(count + 1) // 2])
