@@ -21,9 +21,12 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import recorded_demonstrations
 from mimic.motions.demonstrations import Demonstrations, check_effort
 from mimic.motions.importing import import_demonstrations
+from mimic.motions.mocap.arms import find_arms
+from mimic.motions.mocap.reading import read_motion
 from mimic.retargeting.self_collision import smallest_clearances, touching_line
 from mimic.trainers.progress import is_animated
 
+_OF_POINTS = (".csv", ".npz")  # kinds of files that may have points of a person, or joint angles
 _OF_SOURCE = "joints", "topic", "units", "rate"  # keys of a source of motions
 _NOT_RECORDED = "with source=FILE, whose motions are not recorded"
 
@@ -68,17 +71,24 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
     check_unused(config, ("kind", "count", "seed"), _NOT_RECORDED)
     source = Path(config.source).expanduser()
     model = arm if env.limits == "hardware" else build_arm(dataclasses.replace(env.expert, home=None), "hardware")
-    imported, notes = import_demonstrations(
-        source,
-        arm.embodiment,
-        dt=env.control_dt,
-        horizon=env.horizon,
-        joints=config.joints,
-        topic=config.topic,
-        units=config.units,
-        rate=config.rate,
-        joint_range=model.embodiment.joint_range,
-    )
+    try:
+        imported, notes = import_demonstrations(
+            source,
+            arm.embodiment,
+            dt=env.control_dt,
+            horizon=env.horizon,
+            joints=config.joints,
+            topic=config.topic,
+            units=config.units,
+            rate=config.rate,
+            joint_range=model.embodiment.joint_range,
+        )
+    except ValueError as error:
+        if source.suffix.lower() in _OF_POINTS and _has_person(source):
+            raise ValueError(
+                f"source: {str(source)!r} has points of a person; expected arm=left, right or both"
+            ) from error
+        raise
 
     def run() -> None:
         console = Console()
@@ -93,6 +103,14 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
+
+
+def _has_person(source: Path) -> bool:
+    """Whether a table or npz file has points with an arm of a person."""
+    try:
+        return bool(find_arms(read_motion(source)))
+    except ValueError:
+        return False
 
 
 def _gripper_lines(demonstrations: Demonstrations) -> list[str]:

@@ -156,3 +156,11 @@ def test_the_model_of_the_arm_is_not_overwritten(reason, clip, tmp_path):
     (tmp_path / "a.xml").write_text("mine")
     assert "a.xml' exists" in reason("demonstrations", f"source={clip}", f"out={tmp_path}/a.npz")
     assert (tmp_path / "a.xml").read_text() == "mine"
+
+
+def test_points_of_a_person_without_an_arm_are_a_question(reason, tmp_path):
+    body = person(20)
+    np.savez(tmp_path / "points.npz", names=np.array(body.names), positions=body.positions, rate=body.rate)
+    assert "expected arm=left, right or both" in reason(
+        "demonstrations", f"source={tmp_path}/points.npz", "out=new.npz"
+    )
