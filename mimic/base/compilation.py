@@ -153,9 +153,11 @@ def _compiled(function: Callable[..., T], options: Mapping[str, Any]) -> Callabl
     return call
 
 
-def compiled_quickly(function: Callable[..., T], *shapes: Any) -> Callable[..., T]:
+def compiled_quickly(
+    function: Callable[..., T], *shapes: Any, options: Mapping[str, Any] = _QUICK_CPU_OPTIONS
+) -> Callable[..., T]:
     """The function, compiled for arguments of these shapes, also while JAX traces another one."""
-    return jax.jit(function, compiler_options=_quick_options()).lower(*shapes).compile()
+    return jax.jit(function, compiler_options=_quick_options(options)).lower(*shapes).compile()
 
 
 def has_tracer(tree: Any) -> bool:
@@ -202,7 +204,7 @@ def _leaf_key(leaf: Any) -> Hashable:
     return type(leaf), leaf
 
 
-def _quick_options(options: Mapping[str, Any] = _QUICK_CPU_OPTIONS) -> dict[str, Any]:
+def _quick_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """XLA's options for a function that compiles quickly on a CPU, without those that XLA_FLAGS sets."""
     device = jax.config.values["jax_default_device"] or jax.default_backend()
     if getattr(device, "platform", device) != "cpu":

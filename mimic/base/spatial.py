@@ -56,7 +56,7 @@ def times(x: Scalar, y: Scalar) -> Scalar:
             if constant == 0:
                 return 0.0
             if abs(constant) == 1:
-                return other if constant > 0 else -other
+                return other if constant > 0 else lax.neg(other) if isinstance(other, Tracer) else -other
     operands = _lax_operands(x, y)
     return lax.mul(*operands) if operands else x * y
 
@@ -160,7 +160,7 @@ def axis_rotation(axis: Vector, angle: Scalar) -> Rotation:
     """exp([axis] angle) for a unit axis (Rodrigues); computed by NumPy for a NumPy array of angles."""
     numpy = array_library(angle)
     sine, cosine = numpy.sin(angle), numpy.cos(angle)
-    versine = 1 - cosine
+    versine = minus(1.0, cosine)
 
     def entry(i: int, j: int) -> Scalar:
         square = times(axis[i], axis[j])

@@ -65,7 +65,7 @@ def overlap_correspondence(
       ValueError: trees whose chains do not match.
     """
     overlap, (length_a, length_b), numpy = _overlaps(expert, learner, chains)
-    return jnp.asarray(overlap / length_a[:, None] + overlap / length_b[None, :])
+    return _array(overlap / length_a[:, None] + overlap / length_b[None, :])
 
 
 def arc_length_correspondence(
@@ -89,7 +89,12 @@ def arc_length_correspondence(
         overlap, numpy = overlaps_of_chains(expert.link_length, learner.link_length, jnp)[0], jnp  # type: ignore[union-attr]
     else:
         overlap, _, numpy = _overlaps(expert, learner, chains)
-    return jnp.asarray(overlap.size * overlap / numpy.sum(overlap))
+    return _array(overlap.size * overlap / numpy.sum(overlap))
+
+
+def _array(values: Any) -> Array:
+    """A JAX array; NumPy's are rounded by NumPy, because `jnp.asarray` compiles a function that rounds."""
+    return jnp.asarray(values.astype(jax.dtypes.canonicalize_dtype(values.dtype)))
 
 
 def _overlaps(expert: Embodiment, learner: Embodiment, chains: ChainMatch) -> tuple[Any, Any, ModuleType]:

@@ -266,16 +266,16 @@ def add_position(load: Load, position: Vector, pull: Pull, smoothing: Scalar) ->
 
 def _projection(factor: Scalar, unit: Vector) -> Symmetric:
     """The matrix factor (I - u u^T)."""
-    x, y, z = unit
-    u, v, w = (spatial.times(-factor, component) for component in unit)
-    return factor + u * x, u * y, u * z, factor + v * y, v * z, factor + w * z
+    xx, xy, xz, yy, yz, zz = _outer(spatial.times(-1.0, factor), unit)
+    return spatial.plus(factor, xx), xy, xz, spatial.plus(factor, yy), yz, spatial.plus(factor, zz)
 
 
 def _outer(factor: Scalar, vector: Vector) -> Symmetric:
     """The matrix factor v v^T."""
     x, y, z = vector
-    u, v, w = (spatial.times(factor, component) for component in vector)
-    return u * x, u * y, u * z, v * y, v * z, w * z
+    u, v, w = spatial.scale(factor, vector)
+    times = spatial.times
+    return times(u, x), times(u, y), times(u, z), times(v, y), times(v, z), times(w, z)
 
 
 def _sum(a: Rotation, b: Rotation) -> Rotation:

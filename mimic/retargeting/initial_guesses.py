@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import ArmArrays
 from mimic.arms.embodiment import Embodiment
-from mimic.base.compilation import by_value, compiled_quickly, has_tracer
+from mimic.base.compilation import UNOPTIMIZED, by_value, compiled_quickly, has_tracer
 from mimic.base.spatial import array_library
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 from mimic.retargeting.pose_objective import PoseObjective, Target
@@ -77,7 +77,7 @@ def _states_of_poses(arm: ArmArrays, qpos: Array) -> LinkStates:
 @by_value
 def _compiled_uniform(shape: tuple[int, ...], key: jax.ShapeDtypeStruct | None, dtype: Any) -> Callable[..., Array]:
     limit = jax.ShapeDtypeStruct(shape[-1:], dtype)
-    return compiled_quickly(functools.partial(_uniform, shape), key, limit, limit)
+    return compiled_quickly(functools.partial(_uniform, shape), key, limit, limit, options=UNOPTIMIZED)
 
 
 def _uniform(shape: tuple[int, ...], key: Array | None, lower: Any, upper: Any) -> Array:
