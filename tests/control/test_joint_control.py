@@ -69,17 +69,6 @@ def test_reference_reaches_a_target_angle_without_overshoot() -> None:
     assert np.all(largest < target + 1e-3)
 
 
-def test_reference_stops_within_its_braking_time() -> None:
-    joints = parameters()
-    reference = Reference(np.zeros(JOINTS), joints.velocity.copy(), joints.acceleration.copy())
-    reference = reference._replace(qpos=RANGE.mean(axis=1))
-    for _ in range(1000):
-        reference = joint_control.next_reference(
-            "joint_velocity", reference, np.zeros(JOINTS), joint_control.reference_limits(joints), np
-        )
-    assert np.abs(reference.qvel).max() < 1e-4
-
-
 def test_torque_changes_at_most_at_its_rate() -> None:
     limits, joints, reference = panda_limits(), parameters(), start()
     rng, torque = np.random.default_rng(0), np.zeros(JOINTS)
