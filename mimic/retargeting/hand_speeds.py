@@ -30,23 +30,20 @@ def speeds_needed(
       rotation: 1 where the hand has the angular velocity of the expert's too, 0 where it has the linear one alone.
     """
     of_expert, of_learner = matched_hands(expert, learner).T
-    twist = np.einsum("phrj,pj->phr", hand_jacobians(expert, qpos)[:, of_expert], qvel)
+    twist = np.einsum("phrj,pj->phr", hands_and_jacobians(expert, qpos)[1][:, of_expert], qvel)
     twist = np.einsum("ikp,phri->phrk", base.rotation, twist.reshape(*twist.shape[:2], 2, 3)).reshape(twist.shape)
     counts = np.where(np.arange(6) < 3, 1.0, np.reshape(rotation, (-1, 1, 1)))
-    scaled = counts[..., None] * hand_jacobians(learner, postures)[:, of_learner] * limit
+    scaled = counts[..., None] * hands_and_jacobians(learner, postures)[1][:, of_learner] * limit
     inverse = np.linalg.pinv(scaled.reshape(len(qpos), -1, learner.num_joints), rcond=1e-6)
     return np.abs(np.einsum("pjr,pr->pj", inverse, (counts * twist).reshape(len(qpos), -1))).max(axis=1)
-
-
-def hand_jacobians(arm: Embodiment, qpos: np.ndarray) -> Float[np.ndarray, "poses hands 6 joints"]:
-    """Linear [m] and angular velocity [rad] of the hands for each joint's velocity, in the base frame."""
-    return hands_and_jacobians(arm, qpos)[1]
 
 
 def hands_and_jacobians(
     arm: Embodiment, qpos: Float[np.ndarray, "poses joints"]
 ) -> tuple[Float[np.ndarray, "poses hands 4 4"], Float[np.ndarray, "poses hands 6 joints"]]:
-    """Poses of the hands, as of `hand_poses`, and what `hand_jacobians` returns, in double precision.
+    """Poses of the hands, as of `hand_poses`, and their Jacobians, in double precision.
+
+    Jacobians: linear [m] and angular velocity [rad] of the hands for each joint's velocity, in the base frame.
 
     On scalar components, see `mimic.base.spatial`, which is six times as fast as matrices for a thousand poses.
     """

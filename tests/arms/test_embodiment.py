@@ -1,6 +1,3 @@
-import dataclasses
-
-import jax
 import numpy as np
 import pytest
 
@@ -52,16 +49,6 @@ def test_panda_has_the_manufacturers_kinematics(x64):
     np.testing.assert_allclose(frames.rotation[-1, :, 0], T[:3, 2], atol=1e-12)  # rounding: link 7 is along axis 7
     end = frames.position[-1] + 0.5 * arm.link_lengths[-1] * frames.rotation[-1, :, 0]
     np.testing.assert_allclose(end, T[:3, 3] + FLANGE * T[:3, 2], atol=1e-12)  # rounding
-
-
-def test_panda_links_are_the_segments_of_the_design(x64):
-    arm = panda()
-    starts, ends = np.array(ENDS[:-1]), np.array(ENDS[1:])
-    states = link_states(arm, np.zeros(7), normalized=False)
-    np.testing.assert_allclose(states.position, (starts + ends) / 2, atol=1e-12)  # rounding
-    np.testing.assert_allclose(states.direction * arm.link_lengths[:, None], ends - starts, atol=1e-12)
-    np.testing.assert_allclose(arm.chain_length, np.linalg.norm(ends - starts, axis=1).sum(), atol=1e-12)
-    assert arm.link_names == tuple(f"link{i + 1}" for i in range(7))
 
 
 def test_panda_limits():
@@ -148,17 +135,6 @@ def test_joints_can_be_named_in_any_way():
 # --- the pytree -------------------------------------------------------------------------------------------------------
 
 
-def test_embodiment_is_a_frozen_pytree():
-    arm = panda()
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        arm.name = "other"  # pyright: ignore[reportAttributeAccessIssue]
-    leaves, structure = jax.tree.flatten(arm)
-    assert all(isinstance(leaf, np.ndarray) for leaf in leaves)
-    again = jax.tree.unflatten(structure, leaves)
-    assert (again.joint_names, again.link_joint) == (arm.joint_names, arm.link_joint)
-    assert structure == jax.tree.structure(panda()) != jax.tree.structure(panda(locked=3))
-
-
 @pytest.mark.parametrize("arm", [panda(), panda(locked={3: 1.0}), load_mjcf(random_arms.random_arm(8))])
 def test_link_frames_are_rotations(arm):
     for rotation in arm.link_rotation:
@@ -167,15 +143,6 @@ def test_link_frames_are_rotations(arm):
 
 
 # --- planar arms ------------------------------------------------------------------------------------------------------
-
-
-def test_planar_arm():
-    arm = planar_arm([1.0, 0.5], frame_at=1.0)
-    assert (arm.num_joints, arm.num_links, arm.chain_length) == (2, 2, 1.5)
-    assert arm.link_position.tolist() == [[1, 0, 0], [1.5, 0, 0]]
-    assert arm.joint_axis.tolist() == [[0, 0, 1]] * 2
-    assert np.isinf(arm.torque_limit).all() and np.isinf(arm.velocity_limit).all()
-    assert planar_arm(np.array([1.0])).num_links == 1
 
 
 @pytest.mark.parametrize(

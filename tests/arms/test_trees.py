@@ -60,18 +60,6 @@ def test_the_chain_length_is_that_of_the_longest_chain():
     assert float(segment_arm(arm).chain_length) == pytest.approx(max(lengths))
 
 
-def test_both_arms_hang_on_the_torso():
-    arm = tree()
-    waist = arm.joint_names.index("waist")
-    assert [arm.joint_names[j] for j in range(arm.num_joints) if arm.joint_parent[j] == waist] == [
-        "left_joint0",
-        "right_joint0",
-    ]
-    assert "neck" not in arm.joint_names
-    shared = set(arm.chains[0]) & set(arm.chains[1])
-    assert {arm.link_names[link] for link in shared} == {"base-waist"}
-
-
 @pytest.mark.parametrize(
     ("tips", "message"),
     [

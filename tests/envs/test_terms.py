@@ -11,7 +11,6 @@ import mimic
 from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import layout_of
 from mimic.envs.make import make_env
-from mimic.envs.wrappers import fresh_episodes
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.references import References
 from mimic.metric.capsule_distances import capsule_axes, pair_distances
@@ -101,22 +100,6 @@ def test_self_collision_is_charged_by_the_distances_of_capsules():
 def test_a_built_in_term_cannot_be_registered():
     with pytest.raises(ValueError, match="'distance_gradient' is built in"):
         mimic.register("observation_term", "distance_gradient", angles)
-
-
-def test_terms_are_in_batches_that_restart(terms):
-    env = mimic.make("planar4dof", physics="fused", **SMALL, **terms)
-    wrapped = fresh_episodes(env)
-
-    @jax.jit
-    def rollout(keys):
-        def step(state, _):
-            state = wrapped.step(state, jnp.zeros((3, 4)))
-            return state, (state.obs, jax.vmap(env.observe)(state.pipeline_state))
-
-        return jax.lax.scan(step, wrapped.reset(keys), None, length=7)[1]
-
-    obs, observed = rollout(jax.random.split(jax.random.PRNGKey(0), 3))
-    np.testing.assert_allclose(obs, observed, atol=1e-5)
 
 
 def test_ending_an_episode_early_is_never_better(own_registry, monkeypatch):

@@ -129,27 +129,6 @@ def test_panda_moves_as_in_mujoco(x64, links, locked):
     assert_moves_as_in_mujoco(arm, read_model(panda_path()), np.dtype("float64"), angles)
 
 
-@pytest.mark.parametrize("links", ["merged", "kept"])
-def test_locked_random_arm_moves_as_in_mujoco(x64, links):
-    model = random_arms.random_arm(17)
-    rng = np.random.default_rng(17)
-    locked = {f"joint{i + 1}": rng.uniform(-3, 3) for i in rng.permutation(model.njnt)[: model.njnt // 2]}
-    arm = load_mjcf(model, locked=locked, links=links)
-    assert arm.num_joints == model.njnt - len(locked)
-    if links == "kept":
-        assert_moves_as_in_mujoco(arm, model, jnp.dtype("float64"), locked)
-        return
-    qpos, qvel = motions(arm.num_joints)
-    apart = load_mjcf(model, locked=locked, links="kept")
-    merged, separate = (link_states(a, qpos[0], qvel[0], normalized=False) for a in (arm, apart))
-    first = [apart.link_names.index(name.split("+")[0]) for name in arm.link_names]
-    last = [apart.link_names.index(name.split("+")[-1]) for name in arm.link_names]
-    half = 0.5 * apart.link_lengths[:, None] * separate.direction
-    start, end = (separate.position - half)[np.array(first)], (separate.position + half)[np.array(last)]
-    np.testing.assert_allclose(merged.position, (start + end) / 2, atol=1e-12)  # rounding of a 1 m arm
-    np.testing.assert_allclose(merged.direction * arm.link_lengths[:, None], end - start, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("lengths", "frame_at"), [([0.7], 0.5), ([0.2, 0.1, 0.4, 0.3], 1.0), (np.linspace(0.1, 0.3, LONG + 2), 0.0)]
 )

@@ -33,24 +33,6 @@ def collected(folder):
     return json.loads((folder / "collected.json").read_text())
 
 
-@pytest.mark.parametrize(
-    ("values", "quantile"),  # of Student's t at 0.975: in closed form for 1 and 2 degrees of freedom, then from a table
-    [
-        ([1.0, 4.0], math.tan(0.475 * math.pi)),
-        ([1.0, 2.0, 3.0], 0.95 * math.sqrt(2 / (1 - 0.95**2))),
-        ([0.3, 0.1, 0.2, 0.6, 0.4], 2.776445),
-    ],
-)
-def test_the_interval_is_that_of_students_t(values, quantile):
-    interval = mean_interval(values)
-    spread = math.sqrt(sum((value - interval.mean) ** 2 for value in values) / (len(values) - 1))
-    assert interval.mean == pytest.approx(sum(values) / len(values))
-    assert interval.high is not None and interval.low is not None
-    assert interval.high - interval.mean == pytest.approx(quantile * spread / math.sqrt(len(values)), rel=1e-6)
-    assert interval.mean - interval.low == pytest.approx(interval.high - interval.mean)
-    assert (interval.min, interval.max, interval.n) == (min(values), max(values), len(values))
-
-
 def test_one_run_has_no_interval():
     interval = mean_interval([0.5])
     assert (interval.mean, interval.low, interval.high) == (0.5, None, None)
