@@ -13,6 +13,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.base.npz import read_arrays
 
 FORMAT = "mimic-demonstrations-1"
+_IMPORT = "python -m mimic.demonstrations source=FILE out=NEW.npz imports motions of other formats"
 _ARRAYS = ("qpos", "qvel", "goals", "dt", "seed", "arm", "joint_names", "format")
 _OPTIONAL_ARRAYS = ("torque", "gripper", "gripper_names", "kinds")
 CLIPS = "clips"  # kind of the motions of a file that does not say what drove them
@@ -227,14 +228,18 @@ def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
     """
     name = os.fspath(path)
     if not os.path.isfile(path):
-        raise ValueError(f"demonstrations: no file at {name!r}")
+        what = f"{name!r} is a folder; {_IMPORT}" if os.path.isdir(path) else f"no file at {name!r}"
+        raise ValueError(f"demonstrations: {what}")
+    advice = "" if name.lower().endswith(".npz") else f"; {_IMPORT}"
     try:
         content = read_arrays(path, (*_ARRAYS, *_OPTIONAL_ARRAYS))
         missing = [key for key in _ARRAYS if key not in content]
         if missing:
+            advice = f"; {_IMPORT}" if "format" in missing else advice
             raise ValueError(f"it lacks {', '.join(missing)}; expected are {', '.join(_ARRAYS)}")
     except ValueError as error:
-        raise ValueError(f"demonstrations: {name!r} is not a complete npz file of demonstrations: {error}") from error
+        reason = f"is not a complete npz file of demonstrations: {error}{advice}"
+        raise ValueError(f"demonstrations: {name!r} {reason}") from error
     if str(content["format"]) != FORMAT:
         raise ValueError(f"demonstrations: {name!r} has format {str(content['format'])!r}, expected {FORMAT!r}")
     return _validated(content, name)

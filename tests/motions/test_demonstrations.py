@@ -88,6 +88,17 @@ def test_damaged_files_are_rejected_in_one_line(recorded, tmp_path, case):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("name", ["motions.csv", "other.npz", "folder"])
+def test_files_of_others_are_to_be_imported_first(tmp_path, name):
+    (tmp_path / "motions.csv").write_text("time,joint1\n0,0\n")
+    np.savez(tmp_path / "other.npz", qpos=np.zeros((3, 7)), joint_names=["a"], frequency=1.0)
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(
+        ValueError, match="mimic.demonstrations source=FILE out=NEW.npz imports motions of other formats"
+    ):
+        mimic.load_demonstrations(tmp_path / name)
+
+
 @pytest.mark.parametrize(
     ("expert", "dt", "horizon", "message"),
     [

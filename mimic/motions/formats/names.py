@@ -136,8 +136,8 @@ def find_joints(present: Sequence[str], joints: Sequence[str]) -> tuple[list[str
     """The names in a source that belong to joints of an arm, base to tip, and the rule that found them.
 
     The names are equal; or equal but for case and separators (`joint_1`, `Joint1`); or the source's have one prefix
-    (`panda_joint1`), or the arm's; or the source counts the joints from 0 or 1. None where no rule finds all, or where
-    several prefixes fit, as in a source with two arms.
+    (`panda_joint1`), or the arm's; or one of both ends them in `joint` (`elbow_joint`); or the source counts the joints
+    from 0 or 1. None where no rule finds all, or where several prefixes fit, as in a source with two arms.
     """
     if set(joints) <= set(present):
         return list(joints), ""
@@ -153,6 +153,10 @@ def find_joints(present: Sequence[str], joints: Sequence[str]) -> tuple[list[str
         return [by_key[prefix + key] for key in keys], "by name"
     if fitting:
         return None
+    by_short = {key.removesuffix("joint"): name for key, name in by_key.items()}
+    short = [key.removesuffix("joint") for key in keys]
+    if "" not in short and set(short) <= set(by_short) and len(by_short) == len(by_key):
+        return [by_short[key] for key in short], "by name"
     counted = _counted(by_key, len(joints))
     measured = [prefix for prefix in counted if not is_command(prefix)] or list(counted)
     if measured:

@@ -205,7 +205,7 @@ def seconds(path: Path, time: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
         raise ValueError(
             f"source: the times of {str(path)!r} are in {unit!r}, expected {', '.join(filter(None, SECONDS))}"
         )
-    seconds = (time - time[:1]) * SECONDS[unit]
+    seconds = (time - time[np.isfinite(time)][:1]) * SECONDS[unit]
     if len(time) > 1 and not (interval := float(np.nanmedian(np.diff(seconds)))) < _SLOWEST:
         raise ValueError(
             f"source: the samples of {str(path)!r} are {interval:g} s apart, expected less than {_SLOWEST:g} s; times "

@@ -85,6 +85,12 @@ def test_units_grippers_and_missing_cells(tmp_path):
     np.testing.assert_allclose(motion.gripper[:, 0], np.where(np.isclose(TIME, 0.5), np.nan, TIME))
 
 
+def test_a_first_row_without_a_time_is_none_of_the_motion(tmp_path):
+    (motion,) = read(tmp_path, text(["time", *JOINTS], TIME, QPOS).replace("0.000000,", ",", 1)).motions.values()
+    assert np.isnan(motion.time[0])
+    np.testing.assert_allclose(motion.time[1:], TIME[1:] - TIME[1], atol=1e-9)
+
+
 def test_a_packed_folder_with_a_table_for_each_quantity(tmp_path):
     for name, values in {"run_time": TIME, "run_positions": QPOS, "run_velocity": QVEL, "run_torques": QVEL}.items():
         (tmp_path / f"{name}.txt.gz").write_bytes(gzip.compress("\n".join(map(str, values.ravel())).encode()))
