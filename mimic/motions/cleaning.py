@@ -23,6 +23,7 @@ _JUMP, _MAX_ACCELERATION, _MAX_SPEED = 0.15, 100.0, 3.0
 _ASTRAY = 3  # samples between a jump and the one back, which are a fault of the recording
 _GAP, _GAP_SAMPLES, _GAP_MOTION = 0.5, 5.0, 0.05  # s, median intervals, rad: no samples for longer, while a joint moved
 _LATE, _MOST_LATE = 0.1, 0.1  # s, fraction: samples that arrive out of order are few and late by less
+_UNORDERED = 0.2  # fraction of steps back in time, from which rows are in no order
 _DOUBLED = 0.01  # of the usual interval: equal samples within it are one that was published twice
 _DISAGREEMENT, _SPEED_NOISE = 0.5, 0.05  # of stated and true velocities: relative RMS, and rad/s
 
@@ -92,8 +93,20 @@ def _finite(name: str, motion: Motion, notes: Notes) -> Motion:
 
 
 def _forward_parts(name: str, motion: Motion, notes: Notes) -> list[Motion]:
-    """The parts between steps back in time, each without repeated samples."""
+    """The parts between steps back in time, each without repeated samples.
+
+    Raises:
+      ValueError: rows in no order, of several motions.
+    """
     interval = np.diff(motion.time)
+    if np.sum(interval < 0) > max(_UNORDERED * len(interval), 1):
+        if len(np.unique(motion.time)) < len(motion.time):
+            raise ValueError(
+                f"source: {name} has rows in no order, at times that repeat; expected one motion after another"
+            )
+        notes.add("samples put in the order of their times", f"all {len(motion.time)} in {name}")
+        motion = motion.take(np.argsort(motion.time))
+        interval = np.diff(motion.time)
     late = (interval < 0) & (interval > -_LATE)
     if 0 < np.sum(late) < _MOST_LATE * len(interval):
         notes.add("samples put in the order of their times", f"{np.sum(late)} of {len(interval)} in {name}")

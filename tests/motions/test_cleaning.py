@@ -70,6 +70,16 @@ def test_full_turns_are_undone_and_a_joint_is_rotated_into_its_range():
     assert lines == ["rotated by full turns into the joint range: a of swing"]
 
 
+@pytest.mark.parametrize("order", [np.random.default_rng(0).permutation(len(TIME)), np.arange(len(TIME))[::-1]])
+def test_rows_in_no_order_are_sorted_where_their_times_differ(order):
+    (motion,), lines = clean(swing().take(order))
+    np.testing.assert_array_equal(motion.qpos, swing().qpos)
+    assert lines == ["samples put in the order of their times: all 300 in swing"]
+    twice = swing(np.tile(TIME, 2)).take(np.random.default_rng(0).permutation(2 * len(TIME)))
+    with pytest.raises(ValueError, match="has rows in no order, at times that repeat"):
+        clean(twice)
+
+
 def test_a_reset_splits_a_motion():
     motion = swing()
     motion.qpos[150:, 1] += 1.0

@@ -25,7 +25,19 @@ _LAST, _FIRST = re.compile(r"(.+)[./_ ]([^./_ ]+)"), re.compile(r"([a-z]+)[./_ ]
 _LEAF = re.compile(r"(|.*[./])([^./]+)")
 _NUMBERED = re.compile(r"([a-z]+)[./_ ]([a-z]+)[./_ ]?(\d+)", re.IGNORECASE)
 # Before a quantity's word.
-_WHOSE = "actual", "measured", "target", "desired", "commanded", "command", "joint", "robot", "state", "field"
+_WHOSE = (
+    "actual",
+    "measured",
+    "target",
+    "desired",
+    "commanded",
+    "command",
+    "joint",
+    "robot",
+    "state",
+    "observation",
+    "field",
+)
 # Words beside the name of a joint in a column with other values of it.
 _COPIES = {
     *_WHOSE,
@@ -43,6 +55,7 @@ _COPIES = {
     "raw",
 }
 _COUNTED = re.compile(rf"((?:{'|'.join(_WHOSE)}|motor|servo|axis|dof|[ajq])*)(\d+)")
+_ENDING = re.compile("(?:joint|angle)$")  # of a joint's key, which the other side may lack
 _BY_ORDER = "by their order"
 _GRIPPER = re.compile(r"gripper|finger|jaw|knuckle", re.IGNORECASE)
 
@@ -136,8 +149,8 @@ def find_joints(present: Sequence[str], joints: Sequence[str]) -> tuple[list[str
     """The names in a source that belong to joints of an arm, base to tip, and the rule that found them.
 
     The names are equal; or equal but for case and separators (`joint_1`, `Joint1`); or the source's have one prefix
-    (`panda_joint1`), or the arm's; or one of both ends them in `joint` (`elbow_joint`); or the source counts the joints
-    from 0 or 1. None where no rule finds all, or where several prefixes fit, as in a source with two arms.
+    (`panda_joint1`), or the arm's; or one of both ends them in `joint` or `angle` (`elbow_joint`); or the source counts
+    the joints from 0 or 1. None where no rule finds all, or where several prefixes fit, as in a source with two arms.
     """
     if set(joints) <= set(present):
         return list(joints), ""
@@ -153,8 +166,8 @@ def find_joints(present: Sequence[str], joints: Sequence[str]) -> tuple[list[str
         return [by_key[prefix + key] for key in keys], "by name"
     if fitting:
         return None
-    by_short = {key.removesuffix("joint"): name for key, name in by_key.items()}
-    short = [key.removesuffix("joint") for key in keys]
+    by_short = {_ENDING.sub("", key): name for key, name in by_key.items()}
+    short = [_ENDING.sub("", key) for key in keys]
     if "" not in short and set(short) <= set(by_short) and len(by_short) == len(by_key):
         return [by_short[key] for key in short], "by name"
     counted = _counted(by_key, len(joints))

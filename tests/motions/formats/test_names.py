@@ -45,6 +45,12 @@ def test_columns(text, expected):
         (["main_shoulder_pan", "main_elbow"], ["shoulder_pan", "elbow"], ["main_shoulder_pan", "main_elbow"]),
         (["joint1", "joint2"], ["panda_joint1", "panda_joint2"], ["joint1", "joint2"]),
         (["Shoulder Pan", "elbow"], ["shoulder_pan_joint", "elbow_joint"], ["Shoulder Pan", "elbow"]),
+        (["Joint 1 Angle", "Joint 2 Angle"], ["joint1", "joint2"], ["Joint 1 Angle", "Joint 2 Angle"]),
+        (
+            ["observation.state.0", "observation.state.1", "action.0", "action.1"],
+            ["a", "b"],
+            ["observation.state.0", "observation.state.1"],
+        ),
         (["elbow_joint", "wrist_joint"], ["wrist", "elbow"], ["wrist_joint", "elbow_joint"]),
         (["1", "2", "3"], ["shoulder", "elbow"], ["1", "2"]),
         (["left_joint1", "left_joint2", "right_joint1", "right_joint2"], ["joint1", "joint2"], None),
