@@ -136,7 +136,7 @@ def test_repeated_times_missing_samples_and_restarts_are_told():
     parts, (line,) = clean(swing().take(np.tile(np.arange(len(TIME)), 2)))
     assert len(parts) == 2 and line.startswith("split where time steps back: swing, 1 times")
     with pytest.raises(ValueError, match="two or more samples at times that increase"):
-        clean(swing().take(slice(None, None, -1)))
+        clean(swing().take(slice(0, 1)))
 
 
 def test_samples_out_of_order_and_doubled_ones_a_moment_later_are_repaired():
