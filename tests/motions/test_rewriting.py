@@ -286,14 +286,19 @@ def test_a_recorded_hand_that_wipes_a_table_has_no_warning():
     assert not [note for note in data.notes if note.startswith("warning")]
 
 
-def test_a_table(tmp_path):
-    separator = ";"
+@pytest.mark.parametrize(("separator", "decimal"), [(";", "."), (";", ","), (",", ".")])
+def test_a_table(tmp_path, separator, decimal):
+    def number(value):
+        return f"{value:.6f}".replace(".", decimal)
+
     header = ["note", "time", *(f"{name} [deg]" for name in OLD), "jaw", "demonstration"]
     lines = ["# of a robot", separator.join(header)]
     for episode, count in enumerate(COUNTS):
         for time, angles in zip(*expert_motion(count), strict=True):
             lines.append(
-                separator.join(["held", f"{time:.3f}", *(f"{x:.6f}" for x in np.degrees(angles)), "0.50", str(episode)])
+                separator.join(
+                    [f'"held{separator} firmly"', number(time), *map(number, np.degrees(angles)), "0", str(episode)]
+                )
             )
     source = tmp_path / "motions.csv"
     source.write_text("\n".join(lines) + "\n")
@@ -301,8 +306,8 @@ def test_a_table(tmp_path):
     written = (out / "motions.csv").read_text().splitlines()
     assert written[0] == "# of a robot"
     assert written[1].split(separator) == ["note", "time", *(f"{name} [deg]" for name in NEW), "jaw", "demonstration"]
-    assert written[2].split(separator)[0] == "held"
-    assert written[2].split(separator)[-2:] == ["0.50", "0"]
+    assert written[2].startswith(f'"held{separator} firmly"{separator}{number(0)}{separator}')
+    assert written[2].split(separator)[-2:] == ["0", "0"] and (decimal == "." or "." not in written[2])
     back = read_source(out / "motions.csv", NEW, "", None)
     assert back.unit == "deg"
     for name, motion in back.motions.items():

@@ -1,5 +1,6 @@
 """Reads the cells of tables of text."""
 
+import csv
 import gzip
 import math
 import zlib
@@ -61,7 +62,7 @@ def read_cells(path: Path) -> Cells:
             raise ValueError(f"its rows have {table.shape[1]} cells, its header {len(header)}")
         table = table.reshape(len(rows), len(header) or -1)
         return Cells(comments, header, rows, separator, table)
-    except (OSError, EOFError, ValueError, zlib.error) as error:
+    except (OSError, EOFError, ValueError, csv.Error, zlib.error) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"source: {str(path)!r} is no table of numbers below a header: {reason}") from error
 
@@ -110,8 +111,14 @@ def _text(path: Path) -> str:
 
 
 def split_cells(line: str, separator: str | None) -> list[str]:
-    """The texts of the cells of a line."""
-    return [cell.strip().strip('"').strip() for cell in line.split(separator)]
+    """The texts of the cells of a line; a separator within quotes separates none."""
+    cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True)) if separator else line.split()
+    return [cell.strip().strip('"').strip() for cell in cells]
+
+
+def joined_cells(cells: Sequence[str], separator: str) -> str:
+    """A line with these cells, as `split_cells` reads it."""
+    return separator.join(f'"{cell}"' if separator in cell else cell for cell in cells)
 
 
 def _number(cell: str, separator: str | None) -> float | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from mimic.base.npz import read_arrays
 from mimic.motions.formats.archives import addresses
-from mimic.motions.formats.cells import read_cells
+from mimic.motions.formats.cells import joined_cells, read_cells
 from mimic.motions.formats.episodes import ANGLE, GRIPPER, VELOCITY, Motion
 from mimic.motions.formats.replacing import Column, Replacement, replaced_columns
 from mimic.motions.formats.tables import rows_of_table, tables_by_quantity
@@ -36,23 +36,24 @@ def rewrite_table(source: Path, out: Path, replacement: Replacement, timed: bool
     _, gripper = replacement.grippers.get(entry, ("", ()))
     columns, dropped = replaced_columns(names, old_joints, replacement.joints, gripper)
     separator = text.separator or _BLANK
-    lines = [*text.comments, *([separator.join(column.name for column in columns)] if text.header else [])]
+    decimal = "," if separator != "," and "," in "".join(text.rows[:1]) else "."
+    lines = [*text.comments, *([joined_cells([column.name for column in columns], separator)] if text.header else [])]
     count = dict.fromkeys(episodes, 0)
     for row, episode in zip(text.rows, episodes, strict=True):
         if episode in replacement.kept:
             cells, motion, at = text.cells(row), motions[episode], count[episode]
-            lines.append(separator.join(_cell(cells, column, motion, at) for column in columns))
+            lines.append(joined_cells([_cell(cells, column, motion, at, decimal) for column in columns], separator))
         count[episode] += 1
     _write(out / source.name, lines)
     return dropped
 
 
-def _cell(cells: Sequence[str], column: Column, motion: Motion, at: int) -> str:
+def _cell(cells: Sequence[str], column: Column, motion: Motion, at: int, decimal: str) -> str:
     """The text of a cell: the old one, or the number of the learner's joint at a sample."""
     if column.quantity is None:
         return cells[column.index]
     values = {ANGLE: motion.qpos, VELOCITY: motion.qvel, GRIPPER: motion.gripper}[column.quantity]
-    return f"{values[at, column.joint]:{_DIGITS}}"  # type: ignore[index]  # see `Replacement`
+    return f"{values[at, column.joint]:{_DIGITS}}".replace(".", decimal)  # type: ignore[index]  # see `Replacement`
 
 
 def rewrite_folder_of_tables(source: Path, out: Path, replacement: Replacement) -> list[str]:
