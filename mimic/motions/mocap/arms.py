@@ -9,6 +9,7 @@ from mimic.motions.mocap.points import SIDES, ArmPoints, PointMotion, median_len
 
 # Of the forearm's length: a point beyond the wrist that is nearer is not the hand, and one farther away a prop.
 _SHORT, _LONG = 0.25, 0.9
+_MARKED = 1  # rank of words from which they are those of markers, and not of joints' centres
 _CLUSTER = 0.8  # of the forearm's length: a point on the upper arm that is nearer to the elbow is not the shoulder
 _NAMED = 40  # points in a message
 
@@ -116,12 +117,18 @@ def _shoulder(own: _Named, joints: bool) -> list[int]:
 
 
 def _pick(own: _Named, part: str) -> list[int]:
-    """The points of a joint: two on both sides of it, or those of the best word and the lowest number."""
+    """The points of a joint: two on both sides of it, or those of the best word and the lowest number.
+
+    A point whose name states no side of the joint is the outer one where another is the inner, as ELB beside MEL.
+    """
     found = {i: of for i, of in own.items() if of.part == part}
     for rank in sorted({of.rank for of in found.values()}):
         pair = [i for i, of in found.items() if of.rank == rank and of.place]
         if {found[i].place for i in pair} == {INNER, OUTER}:
             return pair
+    inner, plain = ([i for i, of in found.items() if of.place == place and of.rank >= _MARKED] for place in (INNER, ""))
+    if part == "elbow" and len(inner) == len(plain) == 1 and len(found) == 2:
+        return plain + inner
     best = min((of.rank for of in found.values()), default=0)
     numbers = {i: of.number for i, of in found.items() if of.rank == best}
     return [i for i, number in numbers.items() if number == min(numbers.values())]

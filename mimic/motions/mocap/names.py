@@ -18,7 +18,7 @@ _WORDS = {
     "shoulder": (
         "gh glenohumeral sjc shoulderjc shoulderjointcenter shoulderjointcentre",
         "shoulder sho shldr shld shoul should",
-        "acromion acromium acrom acro acr acj saj ac",
+        "acromion acromium acrom acro acr acj saj sae caj ac",
     ),
     "upper_arm": ("upperarm uparm uarm humerus arm 腕",),
     "elbow": (
@@ -188,9 +188,9 @@ def _readings(word: str, has_side: bool) -> Iterator[tuple[str, tuple[str, int, 
     if known and (has_side or not known[2]):
         yield "", known
     if not has_side:
-        for mark, side in _SIDES.items():
-            for rest in (word.removeprefix(mark), word.removesuffix(mark)):
-                if rest != word and rest in _KNOWN:
+        for without in (str.removeprefix, str.removesuffix):  # RELBL is the right elbow's lateral marker
+            for mark, side in _SIDES.items():
+                if (rest := without(word, mark)) != word and rest in _KNOWN:
                     yield side, _KNOWN[rest]
     if known:
         yield "", known

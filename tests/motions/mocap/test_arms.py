@@ -90,6 +90,8 @@ def test_rotation_bones_halves_and_props_are_no_joints(body):
          "LShoulder+L_shoulder_study L_lelbow_study+L_melbow_study L_lwrist_study+L_mwrist_study"),  # OpenCap
         ("L_SAJ L_HLE L_HME L_RSP L_UHE L_HM2 L_HM5", "L_SAJ L_HLE+L_HME L_RSP+L_UHE L_HM2+L_HM5"),  # CAST
         ("LGH LEL LEM LRS LUS LAC", "LGH LEL+LEM LRS+LUS"),  # ISB
+        ("LSAE LELB LMEL LWRA LWRB RELBL RELBM RMEL", "LSAE LELB+LMEL LWRA+LWRB"),  # the L of RELBL is lateral
+        ("LSHO LEJC LELB LMEL LWRI LRAD", "LSHO LEJC LWRI"),
         ("Bob_LSHO Bob_LELB Bob_LWRI", "Bob_LSHO Bob_LELB Bob_LWRI"),
         ("LeftShoulder LeftArm LeftForeArm LeftHand", "LeftArm LeftForeArm LeftHand"),  # a skeleton without parents
     ],
