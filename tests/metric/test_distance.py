@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic.arms.embodiment import load_mjcf, panda, planar_arm
+from mimic.arms.embodiment import planar_arm
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
 from mimic.metric.distance import (
     PAPER_WEIGHTS,
@@ -28,7 +28,6 @@ from tests.helpers.metric_cases import (
     WEIGHTS,
     states,
 )
-from tests.helpers.random_arms import random_arm
 
 # --- values -----------------------------------------------------------------------------------------------------------
 
@@ -107,29 +106,6 @@ def test_zero_exactly_at_a_match_and_only_there(weights, rotation):
         distance = functools.partial(embodiment_distance, here, weights=weights, rotation=rotation, reduction=reduction)
         assert distance(here, overlap) == pytest.approx(0, abs=0 if rotation == "cosine" else 1e-5)  # as above
         assert distance(elsewhere, overlap) > 0.01
-
-
-@pytest.mark.parametrize("rotation", MEASURES)
-def test_swapping_the_arms_transposes_the_distances(x64, rotation):
-    spatial = load_mjcf(random_arm(2))  # 3 joints
-    a, b = states(spatial, 0, np.float64), states(planar_arm([0.1, 0.2]), 1, np.float64)
-    forth, back = (link_distances(*pair, ALL_WEIGHTS, rotation=rotation) for pair in ((a, b), (b, a)))
-    assert forth.shape == (spatial.num_links, 2)
-    np.testing.assert_allclose(forth, back.T, atol=1e-15)  # the order of two factors
-
-
-def test_rotating_both_arms_changes_nothing(x64):
-    """Distances do not depend on the direction of the base frame: joint 1 of both arms rotates all links about z."""
-    a, b = panda(), panda(locked=(3, 6, 7))
-    rng = np.random.default_rng(0)
-    (qa, va), (qb, vb) = (rng.uniform(-2, 2, (2, arm.num_joints)) for arm in (a, b))
-    before, after = [
-        link_distances(
-            link_states(a, qa + turn * np.eye(7)[0], va), link_states(b, qb + turn * np.eye(4)[0], vb), ALL_WEIGHTS
-        )
-        for turn in (0.0, 2.0)
-    ]
-    np.testing.assert_allclose(after, before, atol=1e-12)  # rounding, 1e-15 a step
 
 
 def test_candidate_points_are_compared_by_place_and_velocity():

@@ -1,6 +1,5 @@
 """The dynamics of any arm against C MuJoCo in double precision."""
 
-import dataclasses
 import itertools
 
 import jax
@@ -127,14 +126,3 @@ def test_the_inverse_holds_on_an_accelerated_base(x64):
     forward = dynamics.acceleration(dynamics.loaded(joints, 1.0, 1.0), qpos, qvel, torque, base)
     np.testing.assert_allclose(forward, qacc, rtol=1e-9)
     assert np.abs(np.subtract(torque, dynamics.inverse(joints, qpos, qvel, qacc))).max() > 1  # weight of the arm
-
-
-def test_damping_and_armature_enter_the_inverse(x64, batch):
-    """Each on its own, so that one cannot replace the other."""
-    arrays, state = batch.arrays, (batch.qpos, batch.qvel, batch.qacc)
-    torque = np.asarray(TORQUES(arrays, *state))
-    for name, rate in (("damping", batch.qvel), ("armature", batch.qacc)):
-        without = dataclasses.replace(arrays, **{name: np.zeros_like(arrays.damping)})
-        change = torque - np.asarray(TORQUES(without, *state))
-        expected = getattr(arrays, name) * rate * arrays.is_free
-        np.testing.assert_allclose(change, expected, atol=1e-9)  # rounding of torques up to 1000 N m
