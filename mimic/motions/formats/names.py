@@ -231,6 +231,8 @@ def select(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str
     notes = []
     if 0 < len(named := [name for name in found if found[name][1] != _BY_ORDER]) < len(found):
         found = {name: found[name] for name in named}
+    if 0 < len(joint_angles := [name for name in found if not _HAND.fullmatch(name)]) < len(found):
+        found = {name: found[name] for name in joint_angles}
     if len(found) > 1 and len(measured := [name for name in found if not is_command(name)]) == 1:
         others = [name for name in found if name not in measured]
         notes.append(f"{measured[0]}: what was measured; topic={' or topic='.join(others)} is what was commanded")
@@ -250,7 +252,8 @@ def select(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str
         notes.append(f"joints: {', '.join(columns)}, found {rule}{among}; joints=[...] names others")
     if gripper and gripper_entry == name and all(column.isdigit() for column in gripper):
         notes.append(f"gripper: {', '.join(gripper)}, after the joints")
-    commands = [other for other in entries if is_command(other) and find_joints(entries[other], joints)]
+    commands = [other for other in entries if is_command(other) and not _HAND.fullmatch(other)]
+    commands = [other for other in commands if find_joints(entries[other], joints)]
     is_clear = name not in commands and not (entry and len(commands) > 1)  # of several arms
     commanded = commands if is_clear else []
     return Selection(name, columns, gripper, gripper_entry, notes, commanded)

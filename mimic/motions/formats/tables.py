@@ -81,6 +81,8 @@ def read_table(path: Path, joints: Sequence[str], rate: float | None = None) -> 
     time, line = np.arange(len(table)) / (rate or 1), ""
     if time_at is not None and not rate:
         time, line = seconds(path, table[:, time_at], unit_of_time(columns[time_at]))
+    elif time_at is not None:
+        line = f"times: {rate:g} samples a second, as rate= says, and not those of {content.names[time_at]}"
     qvel = _velocities(path, table, names[VELOCITY], selection)
     gripper = table[:, [angles[name] for name in selection.gripper]] if selection.gripper else None
     found = hand_position({"": list(angles)})

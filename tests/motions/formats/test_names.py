@@ -77,6 +77,13 @@ def test_what_was_measured_goes_before_what_was_commanded():
     assert (action.entry, action.commanded) == ("action", [])
 
 
+def test_poses_of_the_hand_are_no_angles():
+    numbered = ["1", "2", "3", "4", "5", "6"]
+    entries = dict.fromkeys(["observation.joints", "observation.eef_pose", "action.cartesian_position"], numbered)
+    found = select("set", entries, list("abcdef"), "", "feature")
+    assert (found.entry, found.commanded) == ("observation.joints", [])
+
+
 @pytest.mark.parametrize(
     ("entries", "expected"),
     [(["action", "observation.state", "observation.effort"], ["action"]), (["a/state", "a/command", "b/command"], [])],

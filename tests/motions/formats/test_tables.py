@@ -70,6 +70,9 @@ def test_a_table_without_times_needs_a_rate(tmp_path, header):
 
 
 def test_assumptions_about_a_table_are_lines(tmp_path):
+    (tmp_path / "table.csv").write_text(text(["time", *JOINTS], TIME, QPOS))
+    recording = read_table(tmp_path / "table.csv", JOINTS, rate=100)
+    assert recording.notes == ("times: 100 samples a second, as rate= says, and not those of time",)
     assert read(tmp_path, SPELLINGS["without a header"]).notes == (
         "no header: the columns are time, then the angles and velocities of 2 joints",
         "joints: 1, 2, found by their order; joints=[...] names others",
