@@ -11,11 +11,12 @@ from mimic.arms.embodiment import Embodiment
 from mimic.motions.cleaning import Notes, beyond_range, cleaned
 from mimic.motions.demonstrations import Demonstrations, is_demonstrations, load_demonstrations
 from mimic.motions.doubts import doubts
-from mimic.motions.formats.episodes import Motion, Recording
+from mimic.motions.formats.episodes import Motion, Recording, follows
 from mimic.motions.formats.hdf5 import is_hdf5
 from mimic.motions.formats.hdf5_rewriting import rewrite_hdf5
 from mimic.motions.formats.lerobot_reading import is_lerobot
 from mimic.motions.formats.lerobot_rewriting import rewrite_lerobot
+from mimic.motions.formats.names import numbers_joints
 from mimic.motions.formats.replacing import Replacement
 from mimic.motions.formats.table_rewriting import rewrite_archive, rewrite_folder_of_tables, rewrite_table
 from mimic.motions.formats.tables import TABLES, is_folder_of_tables
@@ -93,20 +94,25 @@ def read_data_set(
     recording = read_source(path, names, topic, rate)
     unit, line = find_unit(str(path), recording, arm.joint_names, ranges, units)
     entry = recording.entry
-    recordings = {entry: recording} | {name: read_source(path, names, name, rate) for name in recording.commanded}
+    commands = {name: read_source(path, names, name, rate) for name in recording.commanded}
+    others = [
+        name for name, found in commands.items() if numbers_joints(found.joints) and not _follow(found, recording)
+    ]
+    recordings = {entry: recording} | {name: found for name, found in commands.items() if name not in others}
     joint_names = {name: found.joints for name, found in recordings.items()}
     motions, faults = _whole(in_rad(recording, unit, ranges), arm)
     if not motions:
         raise ValueError(next(iter(faults.values())))
     every = {entry: motions}
-    for name in recording.commanded:
+    for name in [name for name in recordings if name != entry]:
         found = in_rad(recordings[name], unit, ranges).motions
         every[name] = {episode: _near(found[episode], motion) for episode, motion in motions.items()}
     stated = in_rad(recording, unit, ranges).motions  # with velocities that `cleaned` drops
     raw = {name: stated[name]._replace(qpos=motion.qpos) for name, motion in motions.items()}
     suspicious = [
         beyond_range(motions, arm.joint_names, ranges),
-        *doubts(arm, raw, {name: every[name] for name in recording.commanded}, recording.joints),
+        *doubts(arm, raw, {name: found for name, found in every.items() if name != entry}, recording.joints),
+        *(f"{name}: as in the source, since its numbers are not near the measured angles" for name in others),
     ]
     notes = tuple(filter(None, (*recording.notes, line, *suspicious)))
     grippers = {name: (found.gripper_entry, found.gripper) for name, found in recordings.items() if found.gripper}
@@ -141,6 +147,12 @@ def _whole(recording: Recording, arm: Embodiment) -> tuple[dict[str, Motion], di
         else:
             faults[name] = "; ".join(notes.lines())
     return motions, faults
+
+
+def _follow(commands: Recording, measured: Recording) -> bool:
+    """Whether commands may be the angles as they were commanded, see `follows`."""
+    found = [np.concatenate([motion.qpos for motion in x.motions.values()]) for x in (commands, measured)]
+    return found[0].shape == found[1].shape and follows(*found)
 
 
 def _near(command: Motion, motion: Motion) -> Motion:

@@ -166,6 +166,27 @@ def test_a_lerobot_dataset(tmp_path, version):
         np.testing.assert_allclose(episodes["stats/action/mean"][1][:4], whole[COUNTS[0] :].mean(axis=0), atol=1e-3)
 
 
+def test_actions_without_names_that_are_no_angles_are_carried_over(tmp_path):
+    """Such as steps of the hand, with as many numbers as the arm has joints and gripper."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    source = lerobot(tmp_path / "in", "v3.0")
+    info = json.loads((source / "meta/info.json").read_text())
+    for feature in ("observation.state", "action"):
+        info["features"][feature]["names"] = None
+    (source / "meta/info.json").write_text(json.dumps(info))
+    (file,) = (source / "data").rglob("*.parquet")
+    table, steps = pq.ParquetFile(file).read(), np.random.default_rng(0).uniform(-1, 1, (sum(COUNTS), 4))
+    place = table.column_names.index("action")
+    pq.write_table(table.set_column(place, "action", pa.array(steps.tolist(), table.schema.field("action").type)), file)
+    data, _, out, _ = rewrite(tmp_path, source, units="deg")
+    assert data.commands == ()
+    assert "action: as in the source, since its numbers are not near the measured angles" in data.notes
+    (file,) = (out / "data").rglob("*.parquet")
+    np.testing.assert_allclose(pq.ParquetFile(file).read()["action"].to_pylist(), steps, atol=1e-6)  # float32
+
+
 # --- HDF5 -------------------------------------------------------------------------------------------------------------
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 EXTRA = "datasets"  # of mimic: the packages that read and write these formats
 MAX_NUMBERS = 2**27  # that are read of a dataset: 1 GiB in double precision; seven joints for a day at 100 Hz
+_NEAR = 0.1  # of the range of all angles: how far commanded ones are from measured ones
 EXPERT = "expert."  # before the names of the expert's joints, where they are beside the robot's
 
 
@@ -79,6 +80,15 @@ class Recording(NamedTuple):
     joints: tuple[str, ...] = ()
     commanded: tuple[str, ...] = ()
     gripper_entry: str = ""
+
+
+def follows(commands: Float[np.ndarray, "samples joints"], angles: Float[np.ndarray, "samples joints"]) -> bool:
+    """Whether commands may be the angles as they were commanded, by their values: those of each joint are near it."""
+    known = np.isfinite(commands).all(axis=1) & np.isfinite(angles).all(axis=1)
+    if not known.any():
+        return False
+    apart = np.median(np.abs(commands - angles)[known], axis=0)
+    return bool(np.all(apart < _NEAR * np.ptp(angles[known])))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from mimic.base.distribution import import_extra
 from mimic.base.files import check_file, read_text
-from mimic.motions.formats.episodes import EXTRA, MAX_NUMBERS, Motion, Recording
+from mimic.motions.formats.episodes import EXTRA, MAX_NUMBERS, Motion, Recording, follows
 from mimic.motions.formats.hdf5_objects import object_poses, skeleton
 from mimic.motions.formats.names import Selection, hand_position, is_command, parse_column, select
 from mimic.motions.formats.tables import is_time, seconds, unit_of_time
@@ -26,7 +26,6 @@ OTHER_COPIES = "next_obs"  # robomimic's: the observations of the next sample
 _RATES = ("control_freq", "fps", "frequency", "hz", "rate")  # attributes; in Hz
 _ENVIRONMENTS = ("env_args", "env_info", "env_kwargs")  # attributes with such keys, as JSON
 _STEP_CONTROLLERS, ACTIONS = ("OSC", "IK"), "actions"  # robosuite's types of controllers of the hand
-_NEAR = 0.1  # of the range of all angles: how far commanded ones are from them
 
 
 class Episode(NamedTuple):
@@ -144,12 +143,10 @@ def _entries(episode: Episode, layout: _Layout | None) -> dict[str, list[str]]:
 
 
 def _follows(episode: Episode, command: str, entry: str) -> bool:
-    """Whether a data set of commands has the angles of another one as they were commanded: all columns are near."""
+    """Whether a data set of commands has the angles of another one as they were commanded."""
     if episode.sets[command].shape != episode.sets[entry].shape or not len(episode.sets[entry]):
         return False
-    angles = _columns(episode.sets[entry])
-    apart = np.median(np.abs(_columns(episode.sets[command]) - angles), axis=0)
-    return bool(np.all(apart < _NEAR * np.ptp(angles)))
+    return follows(_columns(episode.sets[command]), _columns(episode.sets[entry]))
 
 
 def _motion(episode: Episode, layout: _Layout | None, selection: Selection, rate: float | None) -> Motion:
