@@ -14,6 +14,7 @@ from mimic.motions.formats.archives import read_archive
 from mimic.motions.formats.episodes import Motion, Recording
 from mimic.motions.formats.hdf5 import SUFFIXES, is_hdf5, read_hdf5
 from mimic.motions.formats.lerobot_reading import is_lerobot, read_lerobot
+from mimic.motions.formats.names import is_by_order
 from mimic.motions.formats.rosbag2 import BAG_FILES, is_rosbag2, read_rosbag2
 from mimic.motions.formats.tables import TABLES, is_folder_of_tables, read_folder_of_tables, read_table
 from mimic.motions.resampling import angles_and_velocities
@@ -127,6 +128,7 @@ def read_recording(
     """
     source, names = Path(path), source_names(arm, joints)
     recording = read_source(source, names, topic, rate)
+    check_named(recording, joints)
     model_range = np.asarray(arm.joint_range if joint_range is None else joint_range, float)
     unit, line = find_unit(str(source), recording, arm.joint_names, model_range, units)
     recording = in_rad(recording, unit, model_range)
@@ -151,11 +153,26 @@ def source_names(arm: Embodiment, joints: Sequence[str]) -> tuple[str, ...]:
     """The names by which an arm's joints are looked for in a source.
 
     Raises:
-      ValueError: not as many as the arm has joints.
+      ValueError: not as many as the arm has joints, or one of them twice.
     """
-    if joints and len(joints) != arm.num_joints:
-        raise ValueError(f"joints: expected {arm.num_joints} names, of {', '.join(arm.joint_names)}, got {len(joints)}")
+    count = len(set(joints))
+    if joints and not count == len(joints) == arm.num_joints:
+        expected = f"{arm.num_joints} different names, of {', '.join(arm.joint_names)}"
+        raise ValueError(
+            f"joints: expected {expected}, got {len(joints)}{f', {count} of them different' * (count < len(joints))}"
+        )
     return tuple(joints) or arm.joint_names
+
+
+def check_named(recording: Recording, joints: Sequence[str]) -> None:
+    """Rejects joints that the user names and that are not in a source, though it counts as many.
+
+    Raises:
+      ValueError: there are some.
+    """
+    missing = [name for name in joints if name not in recording.joints]
+    if missing and recording.joints and is_by_order(recording.joints, joints):
+        raise ValueError(f"joints: expected names in the source, as {', '.join(recording.joints)}, got {missing[0]!r}")
 
 
 def _summary(motions: Mapping[str, Motion]) -> str:
@@ -175,6 +192,8 @@ def _count(motions: int) -> str:
 
 def read_source(source: Path, names: Sequence[str], topic: str, rate: float | None) -> Recording:
     """The motions of a file or a folder, as it has them; see `read_recording`."""
+    if rate is not None and not rate > 0:
+        raise ValueError(f"rate: expected samples per second, above 0, got {rate:g}")
     if is_lerobot(source):
         return read_lerobot(source, names, topic)
     if is_rosbag2(source):

@@ -20,7 +20,7 @@ from mimic.motions.formats.names import numbers_joints
 from mimic.motions.formats.replacing import Replacement
 from mimic.motions.formats.table_rewriting import rewrite_archive, rewrite_folder_of_tables, rewrite_table
 from mimic.motions.formats.tables import TABLES, is_folder_of_tables
-from mimic.motions.importing import read_source, source_names
+from mimic.motions.importing import check_named, read_source, source_names
 from mimic.motions.units import find_unit, from_rad, in_rad
 
 
@@ -92,6 +92,7 @@ def read_data_set(
             raise ValueError("joints, topic, units, rate: expected none with a file of demonstrations, which has them")
         return _demonstrations(path, arm)
     recording = read_source(path, names, topic, rate)
+    check_named(recording, joints)
     unit, line = find_unit(str(path), recording, arm.joint_names, ranges, units)
     entry = recording.entry
     commands = {name: read_source(path, names, name, rate) for name in recording.commanded}

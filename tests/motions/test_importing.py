@@ -149,7 +149,10 @@ def test_joint_names_of_the_file_can_be_given(tmp_path):
         (lambda path: table(path, names=NUMBERED, factor=57.3), [], "12.5664]; degrees need units=deg"),
         (lambda path: table(path, names=NUMBERED, time=TIME[:100]), [], "lasts 1.98 s, but an episode 5 s"),
         (lambda path: table(path, names=NUMBERED, factor=16.0, time=TIME), ["limits=none"], "has a velocity of"),
-        (lambda path: table(path, names=NUMBERED), ["joints=[a]"], "joints: expected 7 names"),
+        (lambda path: table(path, names=NUMBERED), ["joints=[a]"], "joints: expected 7 different names"),
+        (lambda path: table(path, names=NUMBERED), ["joints=[1,2,3,4,5,6,6]"], "got 7, 6 of them different"),
+        (lambda path: table(path, names=NUMBERED), ["joints=[1,2,3,4,5,6,wrist]"], "names in the source, as 1, 2, 3, "
+         "4, 5, 6, 7, got 'wrist'"),
     ],
 )  # fmt: skip
 def test_bad_tables(reason, tmp_path, make, arguments, message):

@@ -181,6 +181,12 @@ def find_joints(present: Sequence[str], joints: Sequence[str]) -> tuple[list[str
     return None
 
 
+def is_by_order(present: Sequence[str], joints: Sequence[str]) -> bool:
+    """Whether names in a source belong to joints by their order alone, see `find_joints`."""
+    found = find_joints(present, joints)
+    return found is not None and found[1] == _BY_ORDER
+
+
 def _counted(by_key: Mapping[str, str], count: int) -> dict[str, list[str]]:
     """Names that number joints from 0 or 1, by what is before the number: as many as an arm has, or more if bare."""
     groups: dict[str, dict[int, str]] = {}
