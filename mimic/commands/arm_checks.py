@@ -111,8 +111,8 @@ def assumptions(config: ArmConfig, arm: Arm) -> Iterator[str]:
     unlimited = names[~np.isfinite(embodiment.velocity_limit)]
     if unlimited.size:
         yield (
-            f"no velocity limit for {_listed(unlimited)}: {DEFAULT_VELOCITY_LIMIT:.2f} rad/s is assumed; the MJCF can "
-            "set it as a custom numeric velocity_limit with one number for each joint"
+            f"no velocity limit for {_listed(unlimited)}: {DEFAULT_VELOCITY_LIMIT:.2f} rad/s is assumed; a URDF can "
+            "set it as <limit velocity>, an MJCF as a custom numeric velocity_limit with one number for each joint"
         )
     unlimited = names[~np.isfinite(embodiment.torque_limit)]
     if unlimited.size:

@@ -210,7 +210,9 @@ def read_source(source: Path, names: Sequence[str], topic: str, rate: float | No
         return read_folder_of_tables(source, names)
     if source.is_dir():
         raise ValueError(
-            f"source: expected a folder of a LeRobot dataset, of rosbag2, HDF5 or tables, got {str(source)!r}"
+            "source: expected a folder of a LeRobot dataset, of rosbag2 or HDF5 files, or of one table each for times, "
+            f"positions and velocities, got {str(source)!r}; tables with a motion each belong into one with a column "
+            "demonstration"
         )
     if not source.is_file():
         raise ValueError(f"source: no file at {str(source)!r}")

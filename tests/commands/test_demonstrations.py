@@ -37,7 +37,10 @@ def test_the_command_records_what_the_library_does(tmp_path):
             "expected one of computed_torque, pid, reach, splines, steps, mixed, got 'dance'",
         ),
         (["out=new.npz", "count=0"], "count: expected a whole number from 1 to 100,000, got 0"),
-        (["out=new.npz", "source={folder}"], "expected a folder of a LeRobot dataset, of rosbag2, HDF5 or tables"),
+        (
+            ["out=new.npz", "source={folder}"],
+            "expected a folder of a LeRobot dataset, of rosbag2 or HDF5 files, or of one table",
+        ),
         (["out=new.npz", "source={csv}", "topic=/a"], "topic: expected only for a LeRobot dataset, a rosbag2 or HDF5"),
         (["out=new.npz", "topic=/a"], "topic: expected none without source="),
         (["out=new.npz", "joints=[a]"], "joints: expected none without source=FILE"),
