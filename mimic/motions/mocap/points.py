@@ -89,7 +89,7 @@ class PointMotion:
 
 def gaps(motion: PointMotion) -> list[tuple[int, int]]:
     """First sample and number of samples of each interval in which a point was not seen."""
-    return _intervals(~np.isfinite(motion.positions).all(axis=(1, 2)))
+    return intervals(~np.isfinite(motion.positions).all(axis=(1, 2)))
 
 
 def bridge_gaps(motion: PointMotion, longest: float = GAP) -> tuple[list[PointMotion], int]:
@@ -106,7 +106,7 @@ def bridge_gaps(motion: PointMotion, longest: float = GAP) -> tuple[list[PointMo
     for index in range(len(motion.names)):
         track = positions[:, index]
         missing = ~np.isfinite(track).all(axis=1)
-        for start, length in _intervals(missing):
+        for start, length in intervals(missing):
             if start > 0 and start + length < count and length / motion.rate <= longest:
                 fraction = np.arange(1, length + 1)[:, None] / (length + 1)
                 track[start : start + length] = (1 - fraction) * track[start - 1] + fraction * track[start + length]
@@ -115,7 +115,7 @@ def bridge_gaps(motion: PointMotion, longest: float = GAP) -> tuple[list[PointMo
                 track[start : start + length] = np.nan
     whole = dataclasses.replace(motion, positions=positions)
     known = np.isfinite(positions).all(axis=(1, 2))
-    return [whole.cut(start, start + length) for start, length in _intervals(known)], bridged
+    return [whole.cut(start, start + length) for start, length in intervals(known)], bridged
 
 
 def jumps(motion: PointMotion, fastest: float = 20.0) -> Int[np.ndarray, " jumps"]:
@@ -146,7 +146,7 @@ def median_length(span: Float[np.ndarray, "time 3"]) -> float:
     return float(np.median(length[known])) if known.any() else math.nan
 
 
-def _intervals(flags: Any) -> list[tuple[int, int]]:
+def intervals(flags: Any) -> list[tuple[int, int]]:
     """First index and length of each run of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return [(int(start), int(stop - start)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]

@@ -21,7 +21,7 @@ from mimic.motions.mocap.conventions import (
     z_up,
 )
 from mimic.motions.mocap.names import parts_of
-from mimic.motions.mocap.points import ArmPoints, PointMotion, median_length
+from mimic.motions.mocap.points import GAP, ArmPoints, PointMotion, intervals, median_length
 from mimic.motions.mocap.tables import Table, read_csv, read_npz, read_trc
 
 KINDS = (".bvh", ".c3d", ".trc", ".csv", ".npz")
@@ -37,6 +37,7 @@ _SYNONYMS = {
     "in": "inch",
     "ft": "foot",
 }
+_FROZEN = 0.03  # m, by which the joint before a marker moves while this one stands still
 _STRETCH = 0.3  # of a length: no arm changes by more
 _UP = {".bvh": "y", ".trc": "y", ".c3d": "z", ".csv": "z", ".npz": "z"}  # where neither file nor body says
 
@@ -79,7 +80,7 @@ def read_motion(
             rest = None if table.rest is None else table.rest[[table.names.index(name) for name in motion.names]]
             up, how = find_up(motion, _UP[suffix], _stated(table.up, UPS), rest)
             motion = _noted(motion, f"up: {up}, {how}")
-        return _without_stretched(_in_metres_z_up(motion, unit or stated, up))
+        return _without_stretched(_without_frozen(_in_metres_z_up(motion, unit or stated, up)))
     except (ValueError, OSError) as error:
         raise ValueError(f"source: {str(source)!r}: {error}") from error
 
@@ -216,6 +217,25 @@ def _full_name(motion: PointMotion, name: str) -> str:
     """A point by its name, also without a prefix that ends in a colon."""
     full = [point for point in motion.names if point.split(":")[-1] == name]
     return full[0] if name not in motion.names and len(full) == 1 else motion.names[motion.index(name)]
+
+
+def _without_frozen(motion: PointMotion) -> PointMotion:
+    """The motion without markers that stand still to the bit while the joint before them moves, as in filled gaps."""
+    positions, wrong = motion.positions.copy(), np.zeros(len(motion.positions), bool)
+    arms = () if any(parent >= 0 for parent in motion.parents) else find_arms(motion).values()
+    for arm in arms:
+        for proximal, distal in ((arm.shoulder, arm.elbow), (arm.elbow, arm.wrist), (arm.wrist, arm.hand)):
+            before = mean_point(motion, proximal)
+            for name in distal:
+                for start, count in intervals(np.all(np.diff(motion.point(name), axis=0) == 0, axis=1)):
+                    moved = np.ptp(before[start : start + count + 1], axis=0).max()
+                    if count > GAP * motion.rate and moved > _FROZEN:
+                        positions[start + 1 : start + count + 1, motion.index(name)] = np.nan
+                        wrong[start + 1 : start + count + 1] = True
+    if not wrong.any():
+        return motion
+    note = f"left out: {wrong.sum()} samples at which a marker stands still while the arm moves"
+    return _noted(dataclasses.replace(motion, positions=positions), note)
 
 
 def _without_stretched(motion: PointMotion) -> PointMotion:

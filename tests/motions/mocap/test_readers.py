@@ -285,6 +285,15 @@ def test_a_person_who_leans_far_is_a_guess(tmp_path, expected):
     assert note.endswith("a guess, capture.up= sets it")
 
 
+def test_markers_that_stand_still_while_the_arm_moves_are_left_out(tmp_path, expected):
+    motion = _markers(expected, MARKERS)
+    wrist = motion.index(find_arms(motion)["left"].wrist[0])
+    motion.positions[10:40, wrist] = motion.positions[10, wrist]
+    found = read_motion(_trc(tmp_path / "clip.trc", motion))
+    assert np.isnan(found.positions[11:40, wrist]).all() and np.isfinite(found.positions[:11]).all()
+    assert "left out: 29 samples at which a marker stands still while the arm moves" in found.notes
+
+
 def test_exchanged_markers_are_left_out(tmp_path, expected):
     elbow, wrist = expected.names.index("LeftForeArm"), expected.names.index("LeftHand")
     positions = expected.positions.copy()
