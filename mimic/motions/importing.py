@@ -211,7 +211,7 @@ def read_source(source: Path, names: Sequence[str], topic: str, rate: float | No
     if source.is_dir():
         raise ValueError(
             "source: expected a folder of a LeRobot dataset, of rosbag2 or HDF5 files, or of one table each for times, "
-            f"positions and velocities, got {str(source)!r}; tables with a motion each belong into one with a column "
+            f"positions and velocities, got {str(source)!r}; join tables of one motion each to one, with a column "
             "demonstration"
         )
     if not source.is_file():
