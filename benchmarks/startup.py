@@ -7,9 +7,16 @@ from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect
 from benchmarks.common.timing import time_call
 
+FIRST_POSE = """
+import mimic
+expert, learner = mimic.panda(), mimic.panda(locked=(3, 6, 7))
+correspondence = mimic.arc_length_correspondence(expert, learner)
+mimic.imitate_pose(expert, learner, expert.home, correspondence, mimic.DistanceWeights(translation=1.0))
+"""
 COMMANDS = {
     "import jax": ("-c", "import jax"),
     "import mimic": ("-c", "import mimic"),
+    "first imitate_pose": ("-c", FIRST_POSE),
     "mimic.train --help": ("-m", "mimic.train", "--help"),
 }
 

@@ -14,7 +14,6 @@ from jaxtyping import Array, Bool, Float
 from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment, in_chain_lengths
 from mimic.base import spatial
-from mimic.base.compat import stored
 from mimic.base.spatial import Rotation, Scalar, Vector
 from mimic.metric.kinematics import JointFrame, LinkStates, hand_vectors, joint_axes, joint_frames
 from mimic.retargeting.optimizers import Derivatives, Scalars
@@ -175,18 +174,18 @@ def hand_cost_derivatives(
     arm, unit, joints = in_chain_lengths(learner), 1 / spatial.scalar(learner.chain_length), learner.num_joints
     lines = [joint_line(arm, arm.hand_joint[hand]) for hand in chosen]
     frames = joint_frames(arm, qpos, None)
-    axes, anchors, vectors = stored(
-        (joint_axes(arm, frames), [frame.anchor for frame in frames[1:]], hand_components(arm, frames))
+    axes, anchors, vectors = (
+        joint_axes(arm, frames),
+        [frame.anchor for frame in frames[1:]],
+        hand_components(arm, frames),
     )
-    of_hands = []
-    for number, (hand, line) in enumerate(zip(chosen, lines, strict=True)):
-        goal = spatial.scale(unit, spatial.vector(target.position[number])), spatial.rotation(target.axes[number])
-        of_line = [axes[joint] for joint in line], [anchors[joint] for joint in line]
-        of_hands.append(_hand_terms(*of_line, vectors[hand], goal, rotation_weight))
     value: Any = 0.0
     gradient: list[Any] = [0.0] * joints
     hessian: list[list[Any]] = [[0.0] * (j + 1) for j in range(joints)]
-    for line, of_hand in zip(lines, stored(of_hands), strict=True):
+    for number, (hand, line) in enumerate(zip(chosen, lines, strict=True)):
+        goal = spatial.scale(unit, spatial.vector(target.position[number])), spatial.rotation(target.axes[number])
+        of_line = [axes[joint] for joint in line], [anchors[joint] for joint in line]
+        of_hand = _hand_terms(*of_line, vectors[hand], goal, rotation_weight)
         value = spatial.plus(value, of_hand.value)
         for place, j in enumerate(line):
             velocity, axis = of_hand.velocities[place], of_hand.axes[place]

@@ -9,6 +9,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from mimic.arms.pose_limits import motion_limits, pose_limits
+from mimic.base.compat import stored
 from mimic.base.compilation import compiled_once
 from mimic.retargeting.exact_chunks import by_chunks
 from mimic.retargeting.exact_pose import exact_solver
@@ -110,7 +111,7 @@ def _back_to_the_hand(*arms: Any) -> Callable[..., tuple[Array, ...]]:
         begin = qpos.astype(poses.dtype).T
         lanes = newton(derivatives, begin, limits, _STEPS, _DAMPING).qpos
         was, now = (is_exact(*(x[0] for x in solver.errors(targets, qpos[:, None]))) for qpos in (begin, lanes))
-        lower, joints = derivatives([*lanes]).hessian, range(len(lanes))
+        lower, joints = stored(derivatives([*lanes])).hessian, range(len(lanes))
         rows = [[lower[max(i, j)][min(i, j)] + jnp.zeros_like(lanes[0]) for j in joints] for i in joints]
         return lanes.T, was, now, jnp.moveaxis(jnp.stack([jnp.stack(row) for row in rows]), -1, 0)
 
