@@ -64,7 +64,8 @@ def check_arguments(arguments: list[str]) -> None:
       arguments: those of the command line, in Hydra's syntax.
 
     Raises:
-      ValueError: an unknown option, a removed key, an empty value, or a config group without the name of a preset.
+      ValueError: an unknown option, no KEY=VALUE, a removed key, an empty value, or a config group without the name of
+        a preset.
       HydraException: an argument that is not in Hydra's syntax.
     """
     parser = get_args_parser()
@@ -72,6 +73,9 @@ def check_arguments(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if options.experimental_rerun:
         raise ValueError("--experimental-rerun: not supported, because it loads a pickle")
+    for argument in options.overrides:
+        if "=" not in argument and not argument.startswith("~"):
+            raise ValueError(f"expected KEY=VALUE, got {argument!r}")
     for override in OverridesParser.create().parse_overrides(options.overrides):
         _check(override)
 

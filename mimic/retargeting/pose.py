@@ -125,6 +125,7 @@ def imitate_pose(
     check_choice("method", method, METHODS)
     # Longer than 40 lines: argument checks, and functions that share the arguments.
     count = ITERATIONS[method] if iterations is None else iterations
+    check_hand(hand, base, expert, learner)
     starts = STARTS[hand] if starts is None else starts
     if starts < 0 or count < 2:
         raise ValueError(f"starts, iterations: expected at least 0 and 2, got {starts} and {count}")
@@ -138,7 +139,6 @@ def imitate_pose(
         )
     warm = None if warm_start is None else checked_poses(learner, _concrete(warm_start), "warm_start")
     metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
-    check_hand(hand, base, expert, learner)
     descents = Descents(method, count, kept)
     dtype = jax.dtypes.canonicalize_dtype(poses.dtype)
     if hand == "exact":

@@ -21,6 +21,7 @@ EARLY = [
     (["trainer=null"], "trainer: expected the name of a preset, as in trainer=ppo, got None"),
     (["env.learner={}"], "env.learner: expected a value, got {}"),
     (["=1"], "expected KEY=VALUE, got '=1'"),
+    (["env", "panda4dof"], "expected KEY=VALUE, got 'env'"),
     (["--bogus"], "unrecognized arguments: --bogus"),
     (["--cfg=bogus"], "invalid choice: 'bogus'"),
     (["--experimental-rerun=x"], "loads a pickle"),

@@ -186,6 +186,7 @@ def test_trajectories_do_not_jump(metric, limits):
         (np.full(7, np.nan), {}, "qpos: expected finite angles"),
         (np.zeros(7), {"method": "magic"}, "method: expected one of newton, gradient_descent, got 'magic'"),
         (np.zeros(7), {"starts": -1}, "starts, iterations"),
+        (np.zeros(7), {"hand": "near"}, "hand: expected one of free, exact, got 'near'"),
         (np.zeros(7), {"kept": 0}, "kept: expected at least 1, or None for all, got 0"),
         (np.zeros(7), {"warm_start": np.zeros(7)}, r"warm_start: expected shape \[..., 4\]"),
     ],
