@@ -14,6 +14,7 @@ from mimic.base.config import check_choice
 
 _log = logging.getLogger(__name__)
 SHORTEST_LINK = 1e-6  # m; below this a link has no direction
+_MAX_LOCKED = 4 * math.pi  # rad; a larger angle is in degrees
 
 Links = Literal["kept", "merged"]
 LINKS = ("kept", "merged")
@@ -119,7 +120,7 @@ def resolve_locked(
       angles: default angles by name for joints that `locked` lists without one; 0 where absent.
 
     Raises:
-      ValueError: an unknown or duplicate joint, an angle that is not a finite number, or no joint left.
+      ValueError: an unknown or duplicate joint, an angle that is not a number of at most 4 pi, or no joint left.
     """
     joints = (locked,) if isinstance(locked, str | int) else locked
     mapping = locked if isinstance(locked, Mapping) else None
@@ -157,8 +158,10 @@ def _angle(name: str, value: float) -> float:
         angle = float(value)
     except (TypeError, ValueError):
         angle = math.nan
-    if not math.isfinite(angle):
-        raise ValueError(f"locked: expected a finite angle [rad] for joint {name!r}, got {value!r}")
+    if not abs(angle) <= _MAX_LOCKED:
+        raise ValueError(
+            f"locked: expected a finite angle [rad] for joint {name!r}, at most {_MAX_LOCKED:.4g}, got {value!r}"
+        )
     return angle
 
 

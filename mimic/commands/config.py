@@ -337,6 +337,8 @@ def base_numbers(base: Any) -> list[float] | None:
     """
     if isinstance(base, list | tuple) and len(base) == len(_BASE):
         if all(isinstance(x, int | float) and math.isfinite(x) for x in base):
+            if abs(base[3]) > 2 * math.pi:
+                raise ValueError(f"base: expected a yaw of at most 2 pi rad, got {base[3]}")
             return [float(number) for number in base]
     elif base in ("same", "auto"):
         return None

@@ -164,12 +164,13 @@ def test_planar_arm_rejects_a_frame_off_the_link(frame_at):
 LOCKED = [
     (["joint8"], "locked: unknown joint 'joint8'; valid are joint1, .*, joint7 or 1 to 7"),
     ([0], "locked: unknown joint 0; valid are "),
+    ({"joint3": 40}, r"locked: expected a finite angle \[rad\] for joint 'joint3', at most 12.57, got 40"),
     ([2.5], "locked: unknown joint 2.5; valid are "),
     ("Joint3", "locked: unknown joint 'Joint3'; valid are "),
     (["joint3", "joint3"], "locked: joint 'joint3' is named twice"),
     ({"joint3": 0.1, 3: 0.1}, "locked: joint 'joint3' is named twice"),
-    ({"joint3": np.nan}, "locked: expected a finite angle .* for joint 'joint3', got nan"),
-    ({"joint3": "bent"}, "locked: expected a finite angle .* for joint 'joint3', got 'bent'"),
+    ({"joint3": np.nan}, "locked: expected a finite angle .* for joint 'joint3', at most 12.57, got nan"),
+    ({"joint3": "bent"}, "locked: expected a finite angle .* for joint 'joint3', at most 12.57, got 'bent'"),
     (range(1, 8), "locked: all 7 joints are locked; at least one must stay free"),
 ]
 

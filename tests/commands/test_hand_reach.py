@@ -79,6 +79,7 @@ def test_without_such_a_pose_there_is_no_number(arm):
     ("arguments", "message"),
     [
         (["panda", "base=[0,1]"], "base: expected same, auto or [x,y,z,yaw], got [0, 1]"),
+        (["panda", "base=[0,0,0,90]"], "base: expected a yaw of at most 2 pi rad, got 90"),
         (["panda", "base=auto", "bound=false"], "base: expected none with bound=false, which compares no hands"),
         (["clip.bvh", "out=pictures"], "out: expected none with clip="),
     ],
