@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import tempfile
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
@@ -72,6 +73,8 @@ def explain(error: Exception) -> str:
     if " not in " in message and isinstance(parent, DictConfig):
         names = [str(name) for name in parent if name != "hydra"]
         return f"unknown key {str(key)!r}; valid are {', '.join(names)}{_suggested_key(str(key), parent)}"
+    if wrong_type := re.fullmatch(r"Invalid type assigned: .* is not a subclass of .*\. value: (.*)", message):
+        return f"{key}: expected keys of its own, as in {key}.KEY=VALUE, got {wrong_type[1]!r:.80}"
     return f"{key}: {message}" if key and str(key) not in message else message
 
 

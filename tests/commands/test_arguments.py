@@ -30,6 +30,7 @@ EARLY = [
 # What Hydra, the sweeper or the config reject.
 LATE = [
     (["env.learner=null"], "env.learner.model"),
+    (["env.metric=paper"], "env.metric: expected keys of its own, as in env.metric.KEY=VALUE, got 'paper'"),
     (["trainer.hidden_layers=[[1]]"], "trainer.hidden_layers: expected 1 to 32 whole numbers"),
     (["env.learner.locked=[[1]]"], "locked: unknown joint [1]"),
     (["--shell-completion"], "subcommand"),
@@ -49,7 +50,7 @@ def test_arguments_that_every_command_rejects(arguments, message):
     assert str(error.value).splitlines() == [str(error.value)]
 
 
-@pytest.mark.slow_for(*(" ".join(arguments)[:50] for arguments, _ in LATE[3:-2]))
+@pytest.mark.slow_for(*(" ".join(arguments)[:50] for arguments, _ in LATE[4:-2]))
 @pytest.mark.parametrize(
     ("arguments", "message"), [EARLY[0], *LATE], ids=[" ".join(arguments)[:50] for arguments, _ in [EARLY[0], *LATE]]
 )
