@@ -69,6 +69,11 @@ def speeds(
             "1.5 s",
         ),
         ("`python -m mimic.train --help`, on two CPU cores", f"{start['mimic.train --help']:.1f} s", "3 s"),
+        (
+            "first `imitate_pose` of a process, 7 to 4; 7 to 7 joints, on two CPU cores [s]",
+            "; ".join(f"{start[f'first imitate_pose, 7 to {joints} joints']:.1f}" for joints in (4, 7)),
+            "1.2 s",
+        ),
         ("optimal poses, Panda 7 to 4 [poses/s]", poses, "1 M"),
         (
             "process start to a pose mapper within 2 %, 4; 7; 3 joints [s]",
