@@ -14,8 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 _log = logging.getLogger(__name__)
 _BRAX_AXIS_NAME = "i"  # brax.training.agents.ppo.train
 # What PyOpenGL and ctypes raise where a graphics library is missing.
@@ -160,6 +158,7 @@ def stored(tree: Any) -> Any:
       tree: its arrays have real numbers, and shapes that broadcast; all results have the same shape.
     """
     import jax
+    import numpy as np
 
     leaves, structure = jax.tree.flatten(tree)
     arrays = [x for x in leaves if not _is_number(x)]
