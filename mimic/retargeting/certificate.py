@@ -32,7 +32,8 @@ class Certificate:
       rotation: angle between them [rad].
       margin: distance of the nearest joint from the end of its range [rad]; negative beyond.
       speed: of the fastest joint between a frame and the next, as a fraction of its limit.
-      clearance: between the learner's links [m], negative where they touch; NaN where its shapes are not known.
+      clearance: between capsules around the learner's links [m], negative where these touch; NaN where its shapes are
+        not known.
       causes: why a frame fails; empty where it does not.
     """
 
