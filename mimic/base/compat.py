@@ -165,12 +165,18 @@ def stored(tree: Any) -> Any:
     if not is_cpu() or not arrays:
         return tree
     shape = jax.numpy.broadcast_shapes(*(x.shape for x in arrays))
-    arrays = _in_pairs([jax.numpy.broadcast_to(x, shape) for x in arrays])
-    last: list[Any] = []
-    for group in (arrays[i : i + _RESULTS] for i in range(0, len(arrays), _RESULTS)):
-        twice = [jax.numpy.broadcast_to(x, (2, *shape)) for x in group]
-        last += jax.lax.reduce(twice, [np.zeros((), x.dtype) for x in group], lambda _, entry: entry, (0,))
-    results = iter(_from_pairs(last))
+
+    @jax.custom_jvp  # JAX differentiates no reduction of several arrays
+    def together(arrays: list[Any]) -> list[Any]:
+        last: list[Any] = []
+        pairs = _in_pairs(arrays)
+        for group in (pairs[i : i + _RESULTS] for i in range(0, len(pairs), _RESULTS)):
+            twice = [jax.numpy.broadcast_to(x, (2, *shape)) for x in group]
+            last += jax.lax.reduce(twice, [np.zeros((), x.dtype) for x in group], lambda _, entry: entry, (0,))
+        return list(_from_pairs(last))
+
+    together.defjvp(lambda primals, tangents: (together(*primals), tangents[0]))
+    results = iter(together([jax.numpy.broadcast_to(x, shape) for x in arrays]))
     return jax.tree.unflatten(structure, [x if _is_number(x) else next(results) for x in leaves])
 
 

@@ -42,6 +42,15 @@ def test_the_cpu_flag_is_for_old_jax_alone(version, needed):
     assert compat.needs_cpu_flag(version) is needed
 
 
+def test_stored_values_have_the_derivatives_of_what_is_stored():
+    def function(x, store):
+        return sum(store([jnp.sin(x), x**2, 3 * x, 2.0])[:3])
+
+    for differentiate in (jax.grad, jax.jacfwd, lambda f: jax.grad(jax.grad(f))):
+        stored, plain = (differentiate(lambda x, s=s: function(x, s))(0.3) for s in (compat.stored, lambda x: x))
+        np.testing.assert_allclose(stored, plain, rtol=1e-6)
+
+
 @pytest.mark.parametrize("count", [2, 3, 31])
 def test_stored_values_are_computed_in_a_kernel_for_each_thirty(count):
     """Pairs become complex numbers, and a reduction of 15 of these is one kernel of XLA's CPU backend."""
