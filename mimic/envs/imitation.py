@@ -41,6 +41,7 @@ _LIMIT_MARGIN, _LIMIT_WIDTH = 0.03, 0.1
 # Numbers that are folded into an episode's key, for its noise and for the step it starts at. 0 to 2 would give the keys
 # that `start` splits the key into.
 _NOISE, FIRST_STEP = 3, 4
+_FORESIGHT = 3, 6, 10  # steps ahead at which a critic knows the expert
 TEST_SETS, TEST_COUNT = 5, 128  # demonstrations of each kind in a set
 
 
@@ -290,8 +291,12 @@ class ImitationEnv(Env):
         return action * self.torque_scale
 
     def privileged(self, state: ArmState) -> Float[Array, " numbers"]:
-        """What only a critic observes: the elapsed fraction of the episode."""
-        return state.step[None] / self.config.horizon
+        """What only a critic observes: the elapsed fraction of the episode, and where the expert's links will be.
+
+        Without the latter the advantages hold the differences between motions that begin alike.
+        """
+        future = [self.expert_at(state.demonstration, state.step + steps).position.ravel() for steps in _FORESIGHT]
+        return jnp.concatenate([state.step[None] / self.config.horizon, *future])
 
     @property
     def privileged_size(self) -> int:

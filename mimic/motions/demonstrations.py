@@ -18,6 +18,7 @@ _ARRAYS = ("qpos", "qvel", "goals", "dt", "seed", "arm", "joint_names", "format"
 _OPTIONAL_ARRAYS = ("torque", "gripper", "gripper_names", "kinds")
 CLIPS = "clips"  # kind of the motions of a file that does not say what drove them
 MAX_VALUE = 1e6  # rad, rad/s, N m, s: no arm's motion has larger values
+_STILL = 0.3  # probability that a joint of a smaller crossover stays at the start
 _ROUNDING = 1e-6  # relative tolerance of a value above its limit: a file in float32 rounds by 6e-8
 RECORDED_SPEED = 3.0  # times the model's velocity limit, which a recorded joint may have: some state 1 rad/s for all
 
@@ -179,19 +180,26 @@ def crossovers(demonstrations: Demonstrations, count: int, seed: int) -> Demonst
 
     If the joints are controlled independently, as by joint-space PD control from one home pose, a mixed demonstration
     is what the expert would do for goals that are mixed in the same way. Otherwise it is at least smooth and within the
-    joint ranges.
+    joint ranges. Every fourth one is also smaller: its displacements from the start are multiplied by a random factor
+    from 0 to 1, and each joint stays at the start with probability 0.3. Without these a policy is inexact where the
+    expert moves little (docs/dynamic_imitation.md).
 
     Args:
       demonstrations: the existing demonstrations.
       count: number of additional demonstrations.
       seed: random seed of the mixing.
     """
-    joints = np.arange(len(demonstrations.joint_names))
-    parents = np.random.default_rng(seed).integers(demonstrations.count, size=(count, len(joints)))
+    joints, rng = np.arange(len(demonstrations.joint_names)), np.random.default_rng(seed)
+    parents = rng.integers(demonstrations.count, size=(count, len(joints)))
+    qpos, qvel = (x.swapaxes(1, 2)[parents, joints].swapaxes(1, 2) for x in (demonstrations.qpos, demonstrations.qvel))
+    goals = demonstrations.goals[parents, joints]
+    moves = rng.uniform(size=parents.shape) > _STILL
+    less = np.where(np.arange(count)[:, None] % 4 == 3, 1 - rng.uniform(size=(count, 1)) * moves, 0.0)
+    start = qpos[:, 0]
     mixed: dict[str, Any] = {
-        "qpos": demonstrations.qpos.swapaxes(1, 2)[parents, joints].swapaxes(1, 2),
-        "qvel": demonstrations.qvel.swapaxes(1, 2)[parents, joints].swapaxes(1, 2),
-        "goals": demonstrations.goals[parents, joints],
+        "qpos": qpos - less[:, None] * (qpos - start[:, None]),
+        "qvel": qvel - less[:, None] * qvel,
+        "goals": goals - less * (goals - start),
     }
     return dataclasses.replace(
         demonstrations, torque=None, gripper=None, gripper_names=(), kinds=("crossover",) * count, **mixed

@@ -103,7 +103,8 @@ class PPOConfig(TrainerConfig):
       crossovers: number of additional training demonstrations, mixed joint by joint from the recorded ones, see
         `crossovers` in mimic/motions/demonstrations.py.
       privileged_critic: whether the value network also observes what the policy never does: the elapsed fraction of the
-        episode and, in a world with an inner loop, what was drawn for it, see `ImitationEnv.privileged`.
+        episode, the expert's future and, in a world with an inner loop, what was drawn for it, see
+        `ImitationEnv.privileged`.
       target_gap: training ends early when the optimality gap on the training demonstrations is at most this; 0 disables
         it.
       evaluations: number of evaluations and checkpoints, as far as whole batches allow; with a target gap five times

@@ -213,3 +213,12 @@ def test_training_and_held_out_demonstrations_differ():
 def test_bad_overrides_are_rejected(overrides, message):
     with pytest.raises(ValueError, match=message):
         mimic.make("panda4dof", **overrides)
+
+
+def test_a_critic_observes_where_the_expert_will_be():
+    env = mimic.make("panda4dof", demonstrations=FEW)
+    state = env.at_step(env.start(jax.random.PRNGKey(0), 1), jnp.asarray(45))
+    positions = np.asarray(env.expert_states.position)[1, [48, 50, 50]]  # the last sample stays
+    np.testing.assert_array_equal(
+        env.privileged(state), np.concatenate([[45 / 50], positions.ravel()], dtype=np.float32)
+    )

@@ -114,8 +114,9 @@ def test_a_critic_observes_what_was_drawn():
     states = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.PRNGKey(0), 200))
     privileged = np.asarray(jax.vmap(env.privileged)(states))
     assert privileged.shape == (200, env.privileged_size) and np.abs(privileged).max() <= 1 + 1e-6
-    joints = env.learner.num_joints
-    payload = privileged[:, 1 + joints]
+    joints, in_the_paper = env.learner.num_joints, mimic.make("panda3dof", demonstrations=FEW)
+    privileged = privileged[:, in_the_paper.privileged_size :]
+    payload = privileged[:, joints]
     np.testing.assert_allclose(payload, np.asarray(states.draw.payload) / 1.5 - 1, atol=1e-6)
     is_constant = np.ptp(privileged, axis=0) == 0
     assert np.all(privileged[:, is_constant] == 0) and 0 < is_constant.sum() < is_constant.size - 2 * joints

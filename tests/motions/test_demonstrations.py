@@ -165,11 +165,11 @@ def test_a_gripper_is_kept_with_the_motions(recorded, tmp_path):
 
 def test_crossovers_take_each_joint_from_one_demonstration():
     original = mimic.record_demonstrations(panda(), 3)
-    mixed = crossovers(original, 20, seed=4)
-    assert mixed.count == 20 and mixed.torque is None  # nobody knows what holds the mixture
+    mixed = crossovers(original, 40, seed=4)
+    assert mixed.count == 40 and mixed.torque is None  # nobody knows what holds the mixture
     assert (mixed.arm, mixed.joint_names, mixed.dt) == (original.arm, original.joint_names, original.dt)
     sources = set()
-    for which in range(mixed.count):
+    for which in np.flatnonzero(np.arange(mixed.count) % 4 < 3):
         chosen = []
         for joint in range(7):
             (source,) = np.flatnonzero((original.qpos[:, :, joint] == mixed.qpos[which, :, joint]).all(axis=1))
@@ -177,9 +177,24 @@ def test_crossovers_take_each_joint_from_one_demonstration():
             assert mixed.goals[which, joint] == original.goals[source, joint]
             chosen.append(int(source))
         sources.add(tuple(chosen))
-    assert len(sources) > 15  # of 3^7 choices
-    np.testing.assert_array_equal(crossovers(original, 20, seed=4).qpos, mixed.qpos)
-    assert not np.array_equal(crossovers(original, 20, seed=5).qpos, mixed.qpos)
+    assert len(sources) > 20  # of 3^7 choices
+    np.testing.assert_array_equal(crossovers(original, 40, seed=4).qpos, mixed.qpos)
+    assert not np.array_equal(crossovers(original, 40, seed=5).qpos, mixed.qpos)
+
+
+def test_every_fourth_crossover_is_smaller_and_some_of_its_joints_stay():
+    original = mimic.record_demonstrations(panda(), 1)  # one parent: the whole crossovers are the original
+    mixed = crossovers(original, 200, seed=4).select(slice(3, None, 4))
+    displacement = original.qpos[0] - original.qpos[0, 0]
+    size = (mixed.qpos - mixed.qpos[:, :1])[:, -1] / displacement[-1]
+    stays = size == 0
+    factor = size.max(axis=1)
+    np.testing.assert_allclose(size, np.where(stays, 0, factor[:, None]), atol=1e-9)
+    assert 0.2 < stays.mean() < 0.4 and factor.min() < 0.1 and 0.9 < factor.max() < 1
+    np.testing.assert_allclose(mixed.qpos, original.qpos[0, 0] + size[:, None] * displacement, atol=1e-12)
+    np.testing.assert_allclose(mixed.qvel, size[:, None] * original.qvel[0], atol=1e-12)
+    ways = original.goals[0] - original.qpos[0, 0]
+    np.testing.assert_allclose(mixed.goals, original.qpos[0, 0] + size * ways, atol=1e-12)
 
 
 @pytest.mark.parametrize("steps", [30, 55])
