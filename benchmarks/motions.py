@@ -13,6 +13,7 @@ RUN is a run directory of `python -m mimic.train`; runs that differ in nothing b
 "whole_motion" is not a controller but a search: the torques of the policy's first seed, improved by iLQR with the whole
 motion and the exact dynamics known. It says how much of a gap there is to learn; better torques may exist.
 
+`excess` is the mean distance above the bound [chain lengths], also where it saves too little over holding for a gap.
 The interval is a 95 % hierarchical bootstrap over seeds and demonstrations. Centre line and hand are measures of
 similarity that nothing optimises, in chain lengths: means over all motions of a set, of the first seed.
 """
@@ -44,7 +45,7 @@ from mimic.metric.kinematics import LinkStates
 from mimic.motions.demonstrations import Demonstrations, load_demonstrations
 from mimic.motions.experts import KINDS
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.config import TrainConfig
+from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import load_config
@@ -77,7 +78,8 @@ def _circle(arm: Arm, rng: np.random.Generator, horizon: int, dt: float) -> np.n
     ends = np.asarray(arm.embodiment.joint_range)[np.arange(len(home)), rng.integers(2, size=len(home))]
     start = home + rng.uniform(0.25, 0.45, len(home)) * (ends - home)
     configuration = mink.Configuration(model, start)
-    frame, axes = configuration.get_transform_frame_to_world(model.nbody - 1, "body"), _random_axes(rng)
+    frame = configuration.get_transform_frame_to_world(model.nbody - 1, "body")
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]  # random, orthogonal
     posture.set_target(start)
     path = [start]
     for step in range(1, horizon + 1):
@@ -90,11 +92,6 @@ def _circle(arm: Arm, rng: np.random.Generator, horizon: int, dt: float) -> np.n
             configuration.integrate_inplace(velocity, dt)
         path.append(configuration.q.copy())
     return np.array(path)
-
-
-def _random_axes(rng: np.random.Generator) -> np.ndarray:
-    """Three random orthogonal unit vectors."""
-    return np.linalg.qr(rng.normal(size=(3, 3)))[0]
 
 
 def figures_of_eight(arm: Arm, count: int, horizon: int, dt: float) -> Demonstrations:
@@ -152,7 +149,8 @@ def rows(name: str, start: str, unseen: Demonstrations, policies: list[tuple[Pat
          controllers: list[str]) -> Iterator[Row]:  # fmt: skip
     """Rows of the policy of several seeds, and of each controller, on a set of motions."""
     run, config = policies[0]
-    config = dataclasses.replace(config, env=dataclasses.replace(config.env, start=start))
+    settings = dataclasses.replace(cast(PPOConfig, config.trainer), crossovers=0)  # none is evaluated
+    config = dataclasses.replace(config, env=dataclasses.replace(config.env, start=start), trainer=settings)
     trainer = make_ppo_trainer(config, run, unseen, None)
     evaluator = trainer.evaluator
     part = evaluator.parts["held_out"]
@@ -174,11 +172,13 @@ def rows(name: str, start: str, unseen: Demonstrations, policies: list[tuple[Pat
         for label, window in windows.items():
             for kind in dict.fromkeys(kinds.tolist()):
                 of_kind = kinds == kind
-                means = (x[..., of_kind, window].mean(axis=-1) for x in (distance, bound, hold))
+                means = [x[..., of_kind, window].mean(axis=-1) for x in (distance, bound, hold)]
                 gap, low, high = gap_interval(*means)
+                mean, best, held = (float(x.mean()) for x in means)
                 yield {
                     "env": config.env.name, "set": name, "kind": f"{kind}{label}", "controller": controller,
                     "gap": gap, "low": low, "high": high, "seeds": len(seeds), "demonstrations": int(of_kind.sum()),
+                    "excess": mean - best, "excess_of_holding": held - best,
                     "largest": float(np.nanmax(_gaps(distance, bound, hold)[:, of_kind])),
                     "centre_line": similarity["centre_line_distance"], "hand": similarity["hand_position_error"],
                 }  # fmt: skip

@@ -10,8 +10,8 @@ ranges, while 30 % of the samples are lost, stall for 2 s, jump, are not finite,
 Limits are checked by differences of the commands, and `clearance_mm` is the smallest distance of capsules around the
 follower's links, where its model has shapes; `recovery` is the time from the first good sample after a fault to
 the first command that follows samples again. Postures: a recorded Panda lifts a cube, and arms with seven joints follow
-from a base of `find_base`; ssik's Tracker and mink start in the same posture. Times: of one step, beside a fixed loop
-of NumPy on the same core, ssik's Tracker and mink.
+from a base of `find_base`; ssik's Tracker and mink start in the same posture. Times: of one step, beside
+ssik's Tracker and mink.
 """
 
 import argparse
@@ -56,7 +56,7 @@ POSTURES = (
     "follower method position_mm_p50:.2f position_mm_p95:.2f hand_direction_deg:.2f elbow:.3f plane_deg:.1f "
     "distance:.4f"
 )
-TIMES = "method p50_ms:.3f p99_ms:.3f p999_ms:.3f core_us_p50:.1f core_us_p99:.1f"
+TIMES = "method p50_ms:.3f p99_ms:.3f p999_ms:.3f"
 # rad/s (data sheets); Piper's model states 0 for its first joint, those of robosuite nothing.
 SPEED = {
     "piper": [3.14, 3.40, 3.14, 3.92, 3.92, 3.92],
@@ -303,17 +303,6 @@ def faulty(
     return np.array(path), recoveries, holding
 
 
-def core_seconds(count: int = 2000) -> np.ndarray:
-    """Seconds of a fixed loop of NumPy: 20 products of small matrices."""
-    matrix, seconds = np.eye(7) + 0.01, []
-    for _ in range(count):
-        began = time.perf_counter()
-        for _ in range(20):
-            np.matmul(matrix, matrix)
-        seconds.append(time.perf_counter() - began)
-    return np.array(seconds)
-
-
 def postures(options: argparse.Namespace) -> Iterator[Row]:
     ((_, recorded, dt),) = demonstrations(options.data / "robosuite_demos", ("lift",))
     leader, qpos = arm("panda", options), resampled(recorded.astype(float), 1 / dt)
@@ -344,11 +333,9 @@ def times(options: argparse.Namespace) -> Iterator[Row]:
         "ssik's Tracker": lambda: tracked_by_ssik(follower, targets, operator.step(None).qpos, SPEED["piper"]),
     }
     for method, run in methods.items():
-        core = 1e6 * core_seconds()
         own, seconds = run()
         row = {"method": method, "steps": len(own), **hand_errors(leader, follower, BASE, qpos, own)}
         row |= dict(zip(("p50_ms", "p99_ms", "p999_ms"), 1e3 * np.percentile(seconds, [50, 99, 99.9]), strict=True))
-        row |= {"core_us_p50": np.median(core), "core_us_p99": np.percentile(core, 99)}
         row |= {"of_limits": ratios(own, operator, _RATE)[0], **resemblance(leader, follower, BASE, qpos, own)}
         yield as_numbers(row)
 
@@ -401,18 +388,18 @@ def main() -> None:
     for name in ("data", "robots", "clip"):
         parser.add_argument(f"--{name}", type=Path)
     options = parser.parse_args()
-    content: dict[str, list[Row]] = {"episodes": [], "sweeps": [], "postures": [], "times": []}
-    makers = {
-        "episodes": lambda: episodes(options),
-        "sweeps": lambda: (sweep(name, options) for name in options.pairs),
-        "postures": lambda: postures(options),
-        "times": lambda: times(options),
+    parts: dict[str, tuple[str, Callable[[], Iterator[Row]]]] = {
+        "episodes": (EPISODES, lambda: episodes(options)),
+        "sweeps": (SWEEPS, lambda: (sweep(name, options) for name in options.pairs)),
+        "postures": (POSTURES, lambda: postures(options)),
+        "times": (TIMES, lambda: times(options)),
     }
+    content: dict[str, list[Row]] = {part: [] for part in parts}
     for part in options.parts:
-        for row in makers[part]():
+        for row in parts[part][1]():
             content[part].append(row)
             write_results(options, **content)
-    for part, columns in (("episodes", EPISODES), ("sweeps", SWEEPS), ("postures", POSTURES), ("times", TIMES)):
+    for part, (columns, _) in parts.items():
         print_table(content[part], columns, part)
 
 

@@ -17,6 +17,7 @@ from benchmarks.common.cells import (
 )
 
 HAND_ROTATION = "hand_rotation_deg"
+SPLITS = {"train": "training", "held_out": "held out"}
 
 # Poses
 
@@ -51,15 +52,17 @@ def mapper_presets(mapper: Results) -> list[Cells]:
 # Dynamic imitation
 
 
-def simulations(paper: Results) -> list[Cells]:
+def simulations(paper: Results, others: Results) -> list[Cells]:
     """Gaps of the paper's three simulations in its setting, mean and standard deviation over the seeds."""
-    rows: list[Cells] = [("joints", "trained on", "training", "held out")]
+    rows: list[Cells] = [
+        ("joints", "trained on", *(f"{name}, {x}" for name in ("mimic", "SB3") for x in SPLITS.values()))
+    ]
     cases = [("one_demonstration", "7 to 7", "1"), *((env, joints, "124") for env, joints in ENVIRONMENTS.items())]
     for case, joints, count in cases:
         gaps = [row["optimality_gap"] for row in where(paper["rows"], case=case)]
-        splits = ([100 * of_seed[split] for of_seed in gaps] for split in ("train", "held_out"))
-        cells = (f"{statistics.fmean(values):.2f} ± {statistics.stdev(values):.2f}" for values in splits)
-        rows.append((joints, count, *cells))
+        of_others = [row["gap"] for row in where(others["rows"], task=case)]
+        values = ([100 * of_seed[split] for of_seed in seeds] for seeds in (gaps, of_others) for split in SPLITS)
+        rows.append((joints, count, *(f"{statistics.fmean(x):.2f} ± {statistics.stdev(x):.2f}" for x in values)))
     return rows
 
 
@@ -76,12 +79,12 @@ def kinds_of_motions(training: Results) -> list[Cells]:
 
 
 def unseen_motions(motions: Results) -> list[Cells]:
-    """Gap of the policy and of controllers without learning on each set and kind of motions, by environment."""
+    """Gap of the policy and of controllers without learning on motions from the home pose, by environment."""
     controllers = {row["controller"] for row in motions["rows"]}
     known = ("copy_joints", "one_step", "nearest_pose", "mpc", "computed_torque", "whole_motion")
     names = [name for name in known if name in controllers]
     rows: list[Cells] = [("joints", "motions", "policy: gap, 95 % interval [%]", *(f"`{name}`" for name in names))]
-    keys = dict.fromkeys((row["env"], row["set"], row["kind"]) for row in motions["rows"])
+    keys = dict.fromkeys((row["env"], row["set"], row["kind"]) for row in motions["rows"] if row["set"] != "new")
     for env, which, kind in keys:
         found = where(motions["rows"], env=env, set=which, kind=kind)
         gaps = {row["controller"]: row for row in found if row["gap"] is not None}
@@ -90,6 +93,15 @@ def unseen_motions(motions: Results) -> list[Cells]:
             label = f"{which}: {kind.replace('_', ' ')}"
             gap, low, high = (f"{100 * gaps['policy'][key]:.2f}" for key in ("gap", "low", "high"))
             rows.append((ENVIRONMENTS[env].split()[-1], label, f"{gap}, {low} to {high}", *others))
+    return rows
+
+
+def motions_from_anywhere(elsewhere: Results) -> list[Cells]:
+    """Mean distance above the bound, in thousandths, on motions that start anywhere, by environment and kind."""
+    rows: list[Cells] = [("joints", "motions", *elsewhere["rows"][0]["excess"])]
+    for row in elsewhere["rows"]:
+        cells = ("" if value is None else f"{1000 * value:.1f}" for value in row["excess"].values())
+        rows.append((ENVIRONMENTS[row["env"]].split()[-1], row["kind"].replace("_", " "), *cells))
     return rows
 
 

@@ -144,7 +144,7 @@ class EnvConfig:
       metric: embodiment distance of the reward.
       demonstrations: motions to imitate.
       start: where the learner starts an episode, at rest: "home", in its home pose (paper); or "nearest", in the pose
-        nearest to the expert's first one, for demonstrations that start anywhere.
+        nearest to the expert's first one, for demonstrations that start anywhere; crossovers then do, too.
       horizon: control steps of an episode.
       control_dt: duration of a control step [s]; the torque is constant within it.
       substeps: physics steps in a control step; with an inner loop there is one for each of its periods of 1 ms.

@@ -175,7 +175,9 @@ def check_effort(demonstrations: Demonstrations, arm: Embodiment, speed: float =
             )
 
 
-def crossovers(demonstrations: Demonstrations, count: int, seed: int) -> Demonstrations:
+def crossovers(
+    demonstrations: Demonstrations, count: int, seed: int, joint_range: Float[np.ndarray, "joints 2"] | None = None
+) -> Demonstrations:
     """Additional demonstrations, mixed from existing ones: each joint moves as in a random one of them.
 
     If the joints are controlled independently, as by joint-space PD control from one home pose, a mixed demonstration
@@ -188,6 +190,8 @@ def crossovers(demonstrations: Demonstrations, count: int, seed: int) -> Demonst
       demonstrations: the existing demonstrations.
       count: number of additional demonstrations.
       seed: random seed of the mixing.
+      joint_range: two of five are also displaced, each joint by a random constant that leaves it in its range [rad], so
+        that they start anywhere; None for motions from where the demonstrations start.
     """
     joints, rng = np.arange(len(demonstrations.joint_names)), np.random.default_rng(seed)
     parents = rng.integers(demonstrations.count, size=(count, len(joints)))
@@ -196,11 +200,12 @@ def crossovers(demonstrations: Demonstrations, count: int, seed: int) -> Demonst
     moves = rng.uniform(size=parents.shape) > _STILL
     less = np.where(np.arange(count)[:, None] % 4 == 3, 1 - rng.uniform(size=(count, 1)) * moves, 0.0)
     start = qpos[:, 0]
-    mixed: dict[str, Any] = {
-        "qpos": qpos - less[:, None] * (qpos - start[:, None]),
-        "qvel": qvel - less[:, None] * qvel,
-        "goals": goals - less * (goals - start),
-    }
+    qpos, goals = qpos - less[:, None] * (qpos - start[:, None]), goals - less * (goals - start)
+    if joint_range is not None:
+        down, up = joint_range[:, 0] - qpos.min(axis=1), joint_range[:, 1] - qpos.max(axis=1)
+        offset = rng.uniform(np.minimum(down, 0), np.maximum(up, 0)) * (np.arange(count)[:, None] % 5 < 2)
+        qpos, goals = qpos + offset[:, None], goals + offset
+    mixed: dict[str, Any] = {"qpos": qpos, "qvel": qvel - less[:, None] * qvel, "goals": goals}
     return dataclasses.replace(
         demonstrations, torque=None, gripper=None, gripper_names=(), kinds=("crossover",) * count, **mixed
     )

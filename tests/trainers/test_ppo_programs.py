@@ -1,5 +1,6 @@
 """The compiled functions of PPO: the transitions that they collect, and the loss."""
 
+import dataclasses
 import functools
 import os
 import subprocess
@@ -20,6 +21,7 @@ from mimic.base.compilation import compiler_options
 from mimic.envs.imitation import arm_state
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import ppo
+from mimic.trainers.ppo.trainer import with_crossovers
 from tests.helpers.tiny import SHORT_ARMS
 
 UNROLLS, ARMS, PASSES = 2, 4, 3
@@ -288,3 +290,20 @@ def test_concurrent_kernels_learn_the_same_as_sequential_ones(physics, monkeypat
         start, _, epoch = ppo.compile_training(env, config, 5)
         learned.append(jax.device_get(epoch()(start(7))))
     assert jax.tree.all(jax.tree.map(np.array_equal, *learned))
+
+
+@pytest.mark.parametrize(("start", "are_displaced"), [("nearest", True), ("home", False)])
+def test_crossovers_start_anywhere_where_the_learner_starts_in_the_nearest_pose(start, are_displaced):
+    env = mimic.make("planar4dof", start=start, demonstrations={"count": 3, "held_out": 1})
+    first = with_crossovers(env, 20, seed=0).qpos[3:, 0]
+    assert np.any(first != env.expert.home) == are_displaced
+    assert np.all(first >= env.expert.joint_range[:, 0]) and np.all(first <= env.expert.joint_range[:, 1])
+
+
+def test_crossovers_of_motions_that_start_apart_start_where_these_do():
+    env = mimic.make("planar4dof", start="nearest", demonstrations={"count": 3, "held_out": 1})
+    apart = env.demonstrations.qpos + np.linspace(0, 0.3, 3)[:, None, None]
+    env = env.with_demonstrations(dataclasses.replace(env.demonstrations, qpos=apart))
+    mixed = with_crossovers(env, 20, seed=0).qpos[3:]
+    whole = mixed[np.arange(20) % 4 < 3, 0]
+    assert np.isclose(whole[:, None], apart[None, :, 0], atol=1e-9).any(axis=1).all()

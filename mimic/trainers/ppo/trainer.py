@@ -64,7 +64,7 @@ class PPOTrainer(Trainer):
             unseen.check_fits(env.expert, config.env.control_dt, unseen.horizon)
             check_effort(unseen, env.expert)
             env, held_out = env.with_horizon(unseen.horizon), unseen
-        mixed = with_crossovers(env.demonstrations, self.settings.crossovers, config.env.demonstrations.seed)
+        mixed = with_crossovers(env, self.settings.crossovers, config.env.demonstrations.seed)
         self._env = env if mixed is env.demonstrations else env.with_demonstrations(mixed)
         self._demonstrations = concatenate(env.demonstrations, held_out)
         self.env_config = dataclasses.replace(config.env, physics=env.physics.name)
@@ -296,8 +296,14 @@ def with_saved_demonstrations(config: EnvConfig, run_dir: Path | None) -> EnvCon
     return dataclasses.replace(config, demonstrations=saved)
 
 
-def with_crossovers(recorded: Demonstrations, count: int, seed: int) -> Demonstrations:
-    """Training demonstrations with additional ones, see `crossovers`."""
+def with_crossovers(env: ImitationEnv, count: int, seed: int) -> Demonstrations:
+    """An environment's demonstrations with additional ones, see `crossovers`.
+
+    Where the learner starts in the nearest pose and all demonstrations in the same one, some of these start anywhere.
+    """
+    recorded = env.demonstrations
     if count == 0 or recorded.count == 1:  # a single demonstration cannot be mixed
         return recorded
-    return concatenate(recorded, crossovers(recorded, count, seed))
+    start_alike = np.allclose(recorded.qpos[:, 0], recorded.qpos[0, 0])
+    joint_range = np.asarray(env.expert.joint_range) if env.config.start == "nearest" and start_alike else None
+    return concatenate(recorded, crossovers(recorded, count, seed, joint_range))
