@@ -8,6 +8,7 @@ from pathlib import Path
 
 from mimic.base.config import BAD_INPUT, suggestion
 from mimic.base.distribution import VERSION
+from mimic.runs.signals import ended_without_reader
 
 _ENTRY_POINT = re.compile(r"`python -m mimic\.(\w+)[^`]*`: (.*)\.")  # the docstring of an entry point
 _HELP = ("-h", "--help")
@@ -23,6 +24,7 @@ def commands() -> dict[str, str]:
     return summaries
 
 
+@ended_without_reader()
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command that the first argument names; returns the exit code.
 

@@ -42,7 +42,7 @@ from mimic.commands.config import (
 from mimic.commands.key_help import key_lines
 from mimic.envs import registered_preset
 from mimic.envs.config import EnvConfig
-from mimic.runs.signals import STOPPED_BY_SIGNAL, watched_signals
+from mimic.runs.signals import STOPPED_BY_SIGNAL, ended_without_reader, watched_signals
 from mimic.runs.sweeps.hydra_plugins import bound_config_files
 from mimic.runs.sweeps.launchers import check_launcher, register_launchers
 from mimic.runs.sweeps.sweeper import FAILED, Outcome, register_sweeper
@@ -55,6 +55,8 @@ FIRST_KEY = {"inspect": "learner", "collect": "folder"}  # key of each command's
 FIRST_KEY_OF_SUFFIX = {  # the same where the argument is a file of another kind
     "inspect": {".bvh": "clip", ".c3d": "clip", ".trc": "clip", ".csv": "clip"},
 }
+# Options of Hydra whose value is the next argument.
+_WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd")
 _OPTIONAL_PARTS = {  # of the config of an environment, and what has them
     "env.world": "an inner loop, as in world=ideal, nominal or hardware",
     "env.arms": "sampled arms, as in env=any_arm or panda_family",
@@ -69,6 +71,7 @@ _BAD_INPUT = (ValueError, OSError, *_CONFIG_ERRORS)
 Work = Callable[[], int | None]  # returns the exit code, 0 for None
 
 
+@ended_without_reader()
 def run(prepare: Callable[[Any], Work], config_name: str) -> None:
     """Runs a command; for bad input it prints one line and exits with 2, and with 1 if files fail later (disk full).
 
@@ -177,7 +180,9 @@ def expand_arguments(arguments: Sequence[str], command: str) -> list[str]:
     Raises:
       ValueError: see `expand_arms`.
     """
-    return list(map(quoted, expand_arms([_with_key(argument, command) for argument in arguments], command)))
+    words = zip(["", *arguments], arguments, strict=False)
+    keyed = [word if option in _WITH_VALUE else _with_key(word, command) for option, word in words]
+    return list(map(quoted, expand_arms(keyed, command)))
 
 
 def _with_key(argument: str, command: str) -> str:
@@ -198,14 +203,20 @@ def _key_of_nothing(arguments: Sequence[str]) -> str:
 
 
 def _failed_run(error: BaseException, exit_code: int) -> Outcome:
-    reason = _one_line(error)
-    print(f"error: {reason}", file=sys.stderr)
-    return Outcome(exit_code, reason)
+    return Outcome(exit_code, _print_error(error))
 
 
 def _exit_with_error(error: BaseException, exit_code: int = BAD_INPUT) -> NoReturn:
-    print(f"error: {_one_line(error)}", file=sys.stderr)
+    _print_error(error)
     sys.exit(exit_code)
+
+
+def _print_error(error: BaseException) -> str:
+    """Prints an error as one line and returns the line, unless it is that nobody reads the output."""
+    if isinstance(error, BrokenPipeError):
+        raise error
+    print(f"error: {(line := _one_line(error))}", file=sys.stderr)
+    return line
 
 
 def process_started() -> float:

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from typing import Any, NoReturn
 
 STOPPED_BY_SIGNAL = 128  # plus the signal's number: the conventional exit code
+_SIGPIPE = 13  # which Python ignores, and Windows lacks
 # Slurm and submitit send SIGUSR1 or SIGUSR2 before a time limit; a terminal that closes sends SIGHUP.
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2")
 NOTED = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
@@ -165,6 +166,22 @@ def exit_hook(hook: Callable[[int], None]) -> Iterator[None]:
         yield
     finally:
         EXIT_HOOKS.remove(hook)
+
+
+@contextmanager
+def ended_without_reader() -> Iterator[None]:
+    """Context in which a process ends silently, as SIGPIPE would end it, where nobody reads its output: `| head -1`."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except (BrokenPipeError, SystemExit) as error:  # Rich exits with 1
+        if not any(isinstance(cause, BrokenPipeError) for cause in (error, error.__context__)):
+            raise
+        for descriptor in (1, 2):  # what is left is written when Python ends
+            os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
+        sys.exit(STOPPED_BY_SIGNAL + _SIGPIPE)
 
 
 def runs_as_command() -> bool:

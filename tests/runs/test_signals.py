@@ -58,6 +58,16 @@ def test_a_command_that_imports_ends_in_one_line(start, number, tmp_path):
     assert process.returncode == 128 + number and not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("arguments", [("-m", "mimic"), ("-u", "-m", "mimic.inspect", "--help")])
+def test_a_command_whose_output_nobody_reads_ends_silently(arguments):
+    """Python writes its output at the end, or with -u as it is printed."""
+    read, write = os.pipe()
+    os.close(read)
+    ended = subprocess.run([sys.executable, *arguments], stdout=write, stderr=subprocess.PIPE, timeout=LATEST_S)
+    os.close(write)
+    assert (ended.returncode, ended.stderr) == (128 + signal.SIGPIPE, b"")
+
+
 def test_importing_the_library_leaves_signals_alone():
     assert "mimic" in sys.modules and signal.getsignal(USR2) == signal.SIG_DFL
 
