@@ -40,10 +40,12 @@ class Range:
     def check(self, key: str, value: Any) -> None:
         """Raises a ValueError with the key, the range and the value if the value is out of range.
 
-        Arrays pass, because they have no value while JAX traces a function.
+        Each number of a NumPy array counts; arrays of JAX pass, which have no value while it traces a function.
         """
         if self.by_name and isinstance(value, Mapping):
             is_valid = all(map(self.contains, value.values()))
+        elif self.entries is None and isinstance(value, np.ndarray):
+            is_valid = all(map(self.contains, value.flat))
         elif self.entries is not None:
             fewest, most = self.entries
             is_valid = not isinstance(value, str) and fewest <= len(value) <= most and all(map(self.contains, value))
@@ -102,6 +104,11 @@ def number(
 def seed_number(default: int = 0) -> Any:
     """A dataclass field for a random seed, a 64-bit integer."""
     return number(default, at_least=-(2**63), at_most=2**63 - 1)
+
+
+def weight_number(default: float) -> Any:
+    """Field for a weight of the metric: the sum of weighted squares stays far from float32's maximum of 3e38."""
+    return number(default, at_least=0.0, at_most=1e6)
 
 
 def checkpoint_number() -> Any:

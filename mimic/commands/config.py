@@ -4,7 +4,6 @@ This module imports other configs only, so that `--help` stays fast.
 """
 
 import dataclasses
-import math
 from typing import Any
 
 from mimic.arms.arm import ArmConfig
@@ -15,6 +14,7 @@ from mimic.envs.config import EnvConfig
 from mimic.evaluation.labels import SPLITS
 from mimic.physics.world import PHYSICS
 from mimic.retargeting.costs import Costs
+from mimic.retargeting.hand_target import placement
 from mimic.trainers.config import trainers
 
 ROBOT_WORLDS = ("nominal", "hardware")
@@ -335,12 +335,10 @@ def base_numbers(base: Any) -> list[float] | None:
     Raises:
       ValueError: the value of the key `base` is nothing of the kind.
     """
-    if isinstance(base, list | tuple) and len(base) == len(_BASE):
-        if all(isinstance(x, int | float) and math.isfinite(x) for x in base):
-            if abs(base[3]) > 2 * math.pi:
-                raise ValueError(f"base: expected a yaw of at most 2 pi rad, got {base[3]}")
-            return [float(number) for number in base]
-    elif base in ("same", "auto"):
+    if isinstance(base, list | tuple) and len(base) == len(_BASE) and all(isinstance(x, int | float) for x in base):
+        placement(base)
+        return [float(number) for number in base]
+    if base in ("same", "auto"):
         return None
     raise ValueError(f"base: expected same, auto or [{','.join(_BASE)}], got {base!r}")
 

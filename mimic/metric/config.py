@@ -14,7 +14,7 @@ from mimic.arms.embodiment import Embodiment, without_hands
 from mimic.arms.link_match import LinkMatch
 from mimic.base import registry
 from mimic.base.config import check_choice
-from mimic.base.ranges import check_ranges, number
+from mimic.base.ranges import check_ranges, weight_number
 from mimic.metric.correspondence import (
     arc_length_correspondence,
     hard_correspondence,
@@ -59,13 +59,12 @@ class MetricConfig:
       chains: which chains of trees correspond: "name" (left to left, thumb to thumb) or "order", see `matched_chains`.
     """
 
-    # The sum of weighted squares stays far from float32's maximum of 3e38.
-    translation: float = number(1.0, at_least=0.0, at_most=1e6)
-    rotation: float = number(1.0, at_least=0.0, at_most=1e6)
-    linear_velocity: float = number(0.001, at_least=0.0, at_most=1e6)
-    angular_velocity: float = number(0.01, at_least=0.0, at_most=1e6)
-    hand_rotation: float = number(0.02, at_least=0.0, at_most=1e6)
-    hand_position: float = number(0.0, at_least=0.0, at_most=1e6)
+    translation: float = weight_number(1.0)
+    rotation: float = weight_number(1.0)
+    linear_velocity: float = weight_number(0.001)
+    angular_velocity: float = weight_number(0.01)
+    hand_rotation: float = weight_number(0.02)
+    hand_position: float = weight_number(0.0)
     adaptive: bool = False
     rotation_measure: str = "cosine"
     correspondence: str = "arc_length"

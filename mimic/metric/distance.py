@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Real
 from mimic.base import spatial
 from mimic.base.batches import over_batch
 from mimic.base.config import check_choice
+from mimic.base.ranges import check_ranges, weight_number
 from mimic.metric.hand import NO_HAND, HandWeights, hand_distance, hand_factors
 from mimic.metric.kinematics import LinkStates
 
@@ -31,10 +32,10 @@ PARTS = ("translation", "rotation", "linear_velocity", "angular_velocity")
 class DistanceWeights:
     """Weights of the parts of the pair distance (paper, eq. 19): numbers, or arrays that broadcast to [n, n_hat]."""
 
-    translation: Any = 0.0
-    rotation: Any = 1.0
-    linear_velocity: Any = 0.0
-    angular_velocity: Any = 0.0
+    translation: Any = weight_number(0.0)
+    rotation: Any = weight_number(1.0)
+    linear_velocity: Any = weight_number(0.0)
+    angular_velocity: Any = weight_number(0.0)
 
 
 PAPER_WEIGHTS = DistanceWeights(translation=0.0, rotation=1.0, linear_velocity=0.001, angular_velocity=0.01)
@@ -111,9 +112,10 @@ def link_distances(
       rotation: the rotational measure, see `rotation_distance`.
 
     Raises:
-      ValueError: an unknown measure, or a weight on a part that candidate points lack.
+      ValueError: an unknown measure, a weight out of range, or one on a part that candidate points lack.
     """
     check_choice("rotation", rotation, ROTATION_MEASURES)
+    _check_weights(weights)
     distances = functools.partial(_link_distances, weights, rotation)
     return over_batch(distances, expert_states, learner_states, axes=2)
 
@@ -152,7 +154,7 @@ class Metric:
       hand_weights: of the distance of the hands, which is added, see `hand_distance`.
 
     Raises:
-      ValueError: an unknown rotation measure or reduction.
+      ValueError: an unknown rotation measure or reduction, or a weight out of range.
     """
 
     correspondence: Correspondence
@@ -164,6 +166,8 @@ class Metric:
     def __post_init__(self) -> None:
         check_choice("rotation", self.rotation, ROTATION_MEASURES)
         check_choice("reduction", self.reduction, REDUCTIONS)
+        _check_weights(self.weights)
+        check_ranges(self.hand_weights, "hand_weights.")
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -303,6 +307,13 @@ def _weight(part: str, value: Any, distances: Array) -> Any:
             f"weights: expected {part} to broadcast to {distances.shape} (expert links, learner links), "
             f"got shape {weight.shape}"
         ) from None
+
+
+def _check_weights(weights: Any) -> None:
+    if isinstance(weights, DistanceWeights):  # not when they are made: their gradients have the same type
+        check_ranges(weights, "weights.")
+    elif not callable(weights) and not isinstance(weights, LinkDistance):
+        raise ValueError(f"weights: expected DistanceWeights, a function or a LinkDistance, got {weights!r:.80}")
 
 
 def _check_candidate_points(a: LinkStates, b: LinkStates, weights: DistanceWeights) -> None:

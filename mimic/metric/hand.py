@@ -9,6 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from mimic.base import spatial
+from mimic.base.ranges import weight_number
 
 
 @struct.dataclass
@@ -35,9 +36,9 @@ class HandWeights:
       pairs: indices of corresponding hands of expert and learner; their mean distance counts.
     """
 
-    rotation: Any = 0.0
-    position: Any = 0.0
-    angular_velocity: Any = 0.0
+    rotation: Any = weight_number(0.0)
+    position: Any = weight_number(0.0)
+    angular_velocity: Any = weight_number(0.0)
     pairs: tuple[tuple[int, int], ...] = struct.field(pytree_node=False, default=((0, 0),))
 
     @property

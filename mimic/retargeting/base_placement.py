@@ -142,6 +142,7 @@ def best_bases(
     for _ in range(_ROUNDS):
         new = bases[np.arange(_BASES) % len(bases)] + generator.uniform(-spread, spread, (_BASES, 4))
         new[0] = bases[0]
+        new[:, 3] -= 2 * np.pi * np.round(new[:, 3] / (2 * np.pi))  # within half a turn
         of_new = _scores(expert, learner, frames, steps, new, metric, jump)
         bases, scores = np.concatenate([bases, new]), np.concatenate([scores, of_new])
         order = np.argsort(-scores, kind="stable")[:_BEST]

@@ -15,6 +15,7 @@ from mimic.control import clearance as control_clearance
 from mimic.metric.capsule_distances import clearance_constants
 from mimic.metric.kinematics import hand_frames
 from mimic.retargeting.exact_chunks import by_chunks
+from mimic.retargeting.hand_target import placement
 
 POSITION, ROTATION = 1e-3, np.radians(0.5)  # m, rad: a hand within both is where the expert's is
 _NO_FLOOR = -1e3  # m; what the arm stands on is not known
@@ -146,13 +147,12 @@ def hand_errors(
         by_chunks(_hands(arm), np.asarray(values, np.float32))
         for arm, values in ((expert, expert_qpos), (learner, qpos))
     )
-    x, y, z, yaw = (0.0, 0.0, 0.0, 0.0) if base is None else base
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    turn, translation = placement(base)
     difference = np.swapaxes(rotation, -1, -2) @ turn @ own_rotation
     skew = difference - np.swapaxes(difference, -1, -2)
     sine = np.sqrt(np.sum(skew**2, axis=(-1, -2)) / 8)
     cosine = (np.trace(difference, axis1=-1, axis2=-2) - 1) / 2
-    distance = np.linalg.norm(hand - own @ turn.T - [x, y, z], axis=-1)
+    distance = np.linalg.norm(hand - own @ turn.T - translation, axis=-1)
     return distance.max(axis=-1), np.arctan2(sine, cosine).max(axis=-1)
 
 

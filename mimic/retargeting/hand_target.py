@@ -69,7 +69,7 @@ def placement(base: Any) -> Placement:
         a `Placement`.
 
     Raises:
-      ValueError: another shape, a number that is not finite, or a matrix that is no pose.
+      ValueError: another shape, a number that is not finite, a yaw beyond 2 pi, or a matrix that is no pose.
     """
     if isinstance(base, Placement):
         return base
@@ -77,6 +77,8 @@ def placement(base: Any) -> Placement:
     if values.shape not in ((4,), (4, 4)) or not np.all(np.isfinite(values)):
         raise ValueError(f"base: expected [x, y, z, yaw] or a pose [4, 4], all finite, got {np.asarray(base).tolist()}")
     if values.shape == (4,):
+        if abs(values[3]) > 2 * np.pi:
+            raise ValueError(f"base: expected a yaw of at most 2 pi rad, got {values[3]:g}")
         cosine, sine = np.cos(values[3]), np.sin(values[3])
         return Placement(np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]]), values[:3])
     rotation = values[:3, :3]

@@ -1,5 +1,6 @@
 """The controls of how the learner's hand follows the expert's: by the metric, exactly, or by a clutch."""
 
+import math
 from typing import Any
 
 import viser
@@ -8,7 +9,8 @@ from mimic.viewer.hand_following import HANDS
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.manual_controls import by_user
 
-_BASE = (("x [m]", 0.01), ("y [m]", 0.01), ("z [m]", 0.01), ("yaw [rad]", 0.05))  # of the learner, with steps
+# Of the learner's base, with steps and maxima.
+_BASE = ("x [m]", 0.01, None), ("y [m]", 0.01, None), ("z [m]", 0.01, None), ("yaw [rad]", 0.05, 2 * math.pi)
 _SCALES = 0.2, 4.0
 
 
@@ -32,8 +34,8 @@ class HandControls:
         mirror = gui.add_checkbox("mirror", hand.mirror, hint="left and right, for a learner that faces you")
         mirror.on_update(by_user(lambda value: change(mirror=value)))
         gui.add_markdown("Base of the learner, in that of the expert:")
-        for index, (label, step) in enumerate(_BASE):
-            number: Any = gui.add_number(label, hand.base[index], step=step)
+        for index, (label, step, most) in enumerate(_BASE):
+            number: Any = gui.add_number(label, hand.base[index], min=most and -most, max=most, step=step)
             number.on_update(by_user(lambda value, index=index: self._place(index, float(value))))
 
     def update(self) -> None:

@@ -15,6 +15,7 @@ from mimic.arms.pose_limits import continuous_joints
 from mimic.base.config import check_choice
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
+from mimic.retargeting.hand_target import placement
 from mimic.retargeting.live_pose import ArmRows, LivePose
 from mimic.retargeting.pose import wrap_angles
 from mimic.retargeting.teleoperation import HANDS as FOLLOWED
@@ -47,8 +48,7 @@ class HandSettings:
 
     def __post_init__(self) -> None:
         check_choice("hand", self.hand, HANDS)
-        if not all(map(math.isfinite, self.base)):
-            raise ValueError(f"base: expected finite numbers [m, rad], got {list(self.base)}")
+        placement(self.base)
         if not 0 < self.scale < math.inf:
             raise ValueError(f"scale: expected a finite number above 0, got {self.scale}")
 

@@ -1,5 +1,6 @@
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +12,14 @@ from mimic.metric.correspondence import hard_correspondence, overlap_corresponde
 from mimic.metric.distance import (
     PAPER_WEIGHTS,
     DistanceWeights,
+    Metric,
     RotationMeasure,
     adaptive_weights,
     embodiment_distance,
     link_distances,
     rotation_distance,
 )
+from mimic.metric.hand import HandWeights
 from mimic.metric.kinematics import candidate_points, link_states
 from tests.helpers.metric_cases import (
     ALL_WEIGHTS,
@@ -202,6 +205,30 @@ def test_candidate_points_reject_weights_on_what_they_lack(part, field):
 
 
 @pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        (DistanceWeights(translation=-1.0), "weights.translation: expected a number from 0 to 1e.06, got -1.0"),
+        (DistanceWeights(rotation=np.array([[1.0], [np.nan], [0.0]])), "weights.rotation: expected a number from 0"),
+        (DistanceWeights(linear_velocity=np.inf), "weights.linear_velocity: .* got inf"),
+        ((0.0, 1.0), "weights: expected DistanceWeights, a function or a LinkDistance, got"),
+        (HandWeights(position=-1.0), "hand_weights.position: expected a number from 0 to 1e.06, got -1.0"),
+    ],
+)
+def test_weights_out_of_range_are_rejected(weights, message):
+    options: Any = {
+        "weights": PAPER_WEIGHTS,
+        ("hand_weights" if isinstance(weights, HandWeights) else "weights"): weights,
+    }
+    with pytest.raises(ValueError, match=message):
+        Metric(np.ones((3, 2)), **options)
+
+
+def test_link_distances_have_the_same_rule():
+    with pytest.raises(ValueError, match="weights.rotation: expected a number from 0"):
+        link_distances(states(EXPERT), states(LEARNER), DistanceWeights(rotation=-1.0))
+
+
 def test_weights_of_another_shape_are_rejected():
     expected = (
         r"^weights: expected rotation to broadcast to \(3, 2\) \(expert links, learner links\), got shape \(3, 3\)$"

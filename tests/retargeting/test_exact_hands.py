@@ -159,7 +159,12 @@ def test_derivatives_of_the_hand_are_those_of_differences():
 
 @pytest.mark.parametrize(
     ("base", "message"),
-    [([0, 0, 0], "expected"), ([0, 0, np.nan, 0], "finite"), (np.diag([1.0, 1, -1, 1]), "rotation")],
+    [
+        ([0] * 3, "expected"),
+        ([0, 0, np.nan, 0], "finite"),
+        ([0, 0, 0, 90], "2 pi rad, got 90"),
+        (np.diag([1.0, 1, -1, 1]), "rotation"),
+    ],
 )
 def test_a_base_that_is_no_pose_is_an_error(base, message):
     with pytest.raises(ValueError, match=message):
