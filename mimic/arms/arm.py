@@ -3,7 +3,9 @@
 import copy
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple, cast
 
 import mujoco
@@ -90,6 +92,25 @@ class ArmConfig:
     def is_file(self) -> bool:
         """Whether the arm is read from a file."""
         return self.model not in BUILT_IN
+
+
+_KEYS = "|".join(field.name for field in dataclasses.fields(ArmConfig))
+_KEY_IN_TEXT = re.compile(rf"(?<![\w.])({_KEYS})(?==)|^({_KEYS})(?=:)")
+
+
+def with_full_keys(text: str, role: str) -> str:
+    """A text about an arm with the keys that set it in full, as in learner.tip= for tip=, and for "tip:" in front."""
+    return _KEY_IN_TEXT.sub(rf"{role}.\g<0>", text)
+
+
+@contextmanager
+def errors_of(role: str) -> Iterator[None]:
+    """Context in which the line of a `ValueError` says of which arm it is, the expert or the learner."""
+    try:
+        yield
+    except ValueError as error:
+        line = with_full_keys(str(error), role)
+        raise ValueError(line if line.startswith(f"{role}.") else f"{role}: {line}") from error
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,6 +1,11 @@
 """Bodies and joints of a MuJoCo model by id: the tree that they form, and their names."""
 
+from collections.abc import Callable
+from typing import Any
+
 import mujoco
+
+from mimic.base.config import suggestion
 
 # As ints: a MuJoCo enum equals a NumPy integer in one order of the operands and not in the other.
 _REVOLUTE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -32,16 +37,15 @@ def ancestors(model: mujoco.MjModel, body: int) -> list[int]:
     return line
 
 
-def body_id(model: mujoco.MjModel, name: str) -> int:
+def body_id(model: mujoco.MjModel, base: str) -> int:
     """Id of the body with a name.
 
     Raises:
       ValueError: no body has this name.
     """
-    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, base)
     if body < 0:
-        names = ", ".join(model.body(b).name or f"#{b}" for b in range(1, model.nbody))
-        raise ValueError(f"the model has no body {name!r}; valid are {names}")
+        raise _unknown("base: expected a body of the model", base, _names(model.body, range(1, model.nbody)))
     return body
 
 
@@ -52,10 +56,17 @@ def tip_body(model: mujoco.MjModel, tip: str) -> int:
       ValueError: no body or site has this name.
     """
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)
-    if site >= 0:
-        return int(model.site_bodyid[site])
-    try:
-        return body_id(model, tip)
-    except ValueError as error:
-        sites = ", ".join(filter(None, (model.site(s).name for s in range(model.nsite)))) or "none"
-        raise ValueError(f"{error}, nor a site of that name; valid are {sites}") from None
+    body = int(model.site_bodyid[site]) if site >= 0 else mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, tip)
+    if body < 0:
+        names = [*_names(model.body, range(1, model.nbody)), *_names(model.site, range(model.nsite))]
+        raise _unknown("tip: expected a body or site of the model", tip, names)
+    return body
+
+
+def _names(named: Callable[[int], Any], ids: range) -> list[str]:
+    return [name for name in (named(index).name for index in ids) if name]
+
+
+def _unknown(expected: str, name: str, valid: list[str]) -> ValueError:
+    choices = ", ".join(dict.fromkeys(valid)) or "none, as it names none"
+    return ValueError(f"{expected}, {choices}, got {name!r:.80}{suggestion(name, valid)}")

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.model_tree import ancestors, body_id, joint_ids
+from mimic.arms.model_tree import ancestors, joint_ids, tip_body
 from mimic.arms.names import finger_side, is_sensor, tool_rank
 
 # As ints: a MuJoCo enum equals a NumPy integer in one order of the operands and not in the other.
@@ -87,7 +87,7 @@ def fixed_frames(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Itera
 def find_frame(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Frame:
     """The frame of the site or body with a name, which the model has; see `tip_body`."""
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
-    return _site_frame(model, data, site) if site >= 0 else body_frame(model, data, body_id(model, name))
+    return _site_frame(model, data, site) if site >= 0 else body_frame(model, data, tip_body(model, name))
 
 
 def best_frame(frames: Iterable[Frame], rank: Callable[[str], int | None], anchor: np.ndarray) -> Frame | None:

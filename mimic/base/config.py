@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from mimic.base.config_files import check_references
 from mimic.base.ranges import ranges
@@ -44,7 +45,26 @@ def typed(config: DictConfig) -> Any:
     """
     check_references(config)
     _check_ranges(config)
-    return OmegaConf.to_object(config)
+    return _as_object(config)
+
+
+def _as_object(node: DictConfig, prefix: str = "") -> Any:
+    """A node as its dataclass; the line of an error of a dataclass in it has the full key."""
+    try:
+        return OmegaConf.to_object(node)
+    except ValueError as error:
+        for key in node:
+            child = node._get_node(key)
+            if (
+                isinstance(child, DictConfig)
+                and not child._is_none()
+                and not child._is_missing()
+                and not child._is_interpolation()
+            ):
+                _as_object(child, f"{prefix}{key}.")
+        if isinstance(error, OmegaConfBaseException) or str(error).partition(":")[0] not in node:
+            raise
+        raise ValueError(f"{prefix}{error}") from error
 
 
 def _check_ranges(node: DictConfig, prefix: str = "") -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import Embodiment, load_mjcf
 from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.base.overrides import setting, shell_words
@@ -140,7 +140,7 @@ def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Pa
     model = out.with_suffix(".xml")
     if model.exists():
         raise ValueError(f"out: {str(model)!r} exists, where the model of the arm would be written")
-    learner = build_arm(env.learner, env.limits, env.metric.links).embodiment
+    learner = env.build_arm("learner").embodiment
     capture = read_arm(source, config.arm or "right", capture_config, fixed_fraction(learner))
     parts = capture.parts
     zero = zero_frames(parts[int(np.argmax([len(part.start) for part in parts]))])

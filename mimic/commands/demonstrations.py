@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from mimic.arms.arm import Arm, build_arm
+from mimic.arms.arm import Arm, build_arm, errors_of
 from mimic.arms.capsules import fit_capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.base.config import check_unused, new_file
@@ -44,7 +44,8 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
     if config.source and (config.arm or Path(config.source).suffix.lower() in MOTION_CAPTURE):
         check_unused(config, ("kind", "count", "seed", "limits", *_OF_SOURCE), _NOT_RECORDED)
         return prepare_capture(config, env, out, plot)
-    arm = build_arm(env.expert, env.limits)
+    with errors_of("expert"):
+        arm = build_arm(env.expert, env.limits)
     if config.source:
         return _prepare_import(config, env, arm, out, plot)
     check_unused(config, _OF_SOURCE, "without source=FILE")

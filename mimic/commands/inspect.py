@@ -16,7 +16,7 @@ from rich.console import Console  # noqa: E402
 from rich.markup import escape  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from mimic.arms.arm import Arm, ArmConfig, finite_velocity_limit, torque_scale
+from mimic.arms.arm import Arm, ArmConfig, finite_velocity_limit, torque_scale, with_full_keys
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.arms.simulation_model import effective_inertia  # noqa: E402
 from mimic.base.config import new_folder  # noqa: E402
@@ -117,7 +117,7 @@ def _inspect(
     return Inspection(
         joints=_joints(learner, config.learner, env),
         links=_links(expert, learner, env),
-        ends=[end.reason for end in learner.ends],
+        ends=[with_full_keys(end.reason, "learner") for end in learner.ends],
         ignored=list(learner.notes),
         assumed=list(arm_checks.assumptions(config.learner, learner)),
         warnings=[

@@ -62,7 +62,7 @@ def read_clip(config: ViewConfig, env: EnvConfig) -> tuple[Clip, LinkMotion, np.
     """
     capture = config.capture
     check_unused(capture, _OF_WINDOWS, "with this source of a view, which cuts no windows", "capture.")
-    fixed = fixed_fraction(build_arm(env.learner, env.limits, env.metric.links).embodiment)
+    fixed = fixed_fraction(env.build_arm("learner").embodiment)
     read = read_arm(Path(config.source).expanduser(), config.arm or "right", capture, fixed)
     kept = [index for index, part in enumerate(read.parts) if len(part.start) > 2]
     if not kept:
@@ -153,7 +153,7 @@ def wait_for_arm(
     """
     side, signals, say = config.arm or "right", Signals(), Said()
 
-    fixed = fixed_fraction(build_arm(env.learner, env.limits, env.metric.links).embodiment)
+    fixed = fixed_fraction(env.build_arm("learner").embodiment)
     print(f"view: waiting for points at {config.source}   (Ctrl-C ends it)", flush=True)
     arm, samples, incomplete = None, [], 0
     with noted_signals(signals, "view: ending; repeat to stop immediately"):

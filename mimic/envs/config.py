@@ -3,7 +3,7 @@
 import dataclasses
 from typing import ClassVar, Literal
 
-from mimic.arms.arm import Arm, ArmConfig, ArmPair, build_arm
+from mimic.arms.arm import Arm, ArmConfig, ArmPair, build_arm, errors_of
 from mimic.arms.embodiment import LIMITS
 from mimic.base import registry
 from mimic.base.config import check_choice
@@ -243,13 +243,12 @@ class EnvConfig:
           ValueError: an arm that cannot be loaded, or a learner that is drawn for each episode.
         """
         self.check_one_learner()
-        return ArmPair(self._arm("expert"), self._arm("learner"))
+        return ArmPair(self.build_arm("expert"), self.build_arm("learner"))
 
-    def _arm(self, role: str) -> Arm:
-        try:
+    def build_arm(self, role: str) -> Arm:
+        """The "expert" or the "learner", with the links that the metric compares; the line of an error names it."""
+        with errors_of(role):
             return build_arm(getattr(self, role), self.limits, self.metric.links)
-        except ValueError as error:
-            raise ValueError(f"{role}: {error}") from error
 
     def check_one_learner(self) -> None:
         """Raises a ValueError where the learner is another arm in each episode."""

@@ -17,7 +17,7 @@ import numpy as np
 from brax.envs.base import Env, State
 from jaxtyping import Array, Bool, Float, Int
 
-from mimic.arms.arm import Arm, build_arm, torque_scale
+from mimic.arms.arm import Arm, torque_scale
 from mimic.arms.arrays import ArmArrays
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.drives import drives_of
@@ -500,7 +500,7 @@ def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple
       ValueError: a file or source that cannot be read, does not fit the expert, exceeds its limits, or has too few
         demonstrations.
     """
-    expert = expert or build_arm(config.expert, config.limits, config.metric.links)
+    expert = expert or config.build_arm("expert")
     settings = config.demonstrations
     if settings.path or settings.source:
         loaded, label = _demonstrations_of_others(config, expert)
@@ -566,7 +566,7 @@ def test_demonstrations(config: EnvConfig) -> Demonstrations:
             f"split: expected none where the demonstrations are those of {settings.path or settings.source!r}, got "
             "test; demonstrations=FILE evaluates others"
         )
-    expert = build_arm(config.expert, config.limits, config.metric.links)
+    expert = config.build_arm("expert")
     return recorded_demonstrations(config, expert, TEST_SETS * TEST_COUNT * len(KINDS), kind=MIXED, test=True)
 
 

@@ -17,7 +17,7 @@ from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from mimic.arms.arm import Arm, build_arm
+from mimic.arms.arm import Arm
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.arms.sampler import Sampler
 from mimic.envs.arm_state import ArmState, arm_state
@@ -98,7 +98,7 @@ class AnyArmEnv(ImitationEnv):
     def _set_arms(self) -> Arm:
         config = self.config
         self._weights = check_metric(config.metric)
-        expert = build_arm(config.expert, config.limits, config.metric.links)
+        expert = config.build_arm("expert")
         self.expert = expert.embodiment
         self.expert_arrays = jax.tree.map(jnp.asarray, arm_arrays(expert).astype(np.float32))
         self.physics = PhysicsChoice("fused", "the arm is data of the compiled function")

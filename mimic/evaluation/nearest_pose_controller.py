@@ -10,7 +10,6 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
-from mimic.arms.arm import build_arm
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, masked_arrays
 from mimic.envs.arm_state import arm_state
 from mimic.envs.imitation import ImitationEnv
@@ -50,7 +49,7 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
       ValueError: a tree, an arm with more joints or links than `ArmArrays` has, or another metric than the default one.
     """
     config = env.config
-    expert = build_arm(config.expert, config.limits, config.metric.links)
+    expert = config.build_arm("expert")
     hand_rotation = env.metric.hand_weights.rotation
     weights = check_metric(dataclasses.replace(config.metric, hand_rotation=0.0))
     if policy is None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.arm import build_arm, finite_velocity_limit
+from mimic.arms.arm import finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import EnvConfig
 from mimic.retargeting.teleoperation_recording import TeleoperationRecorder
@@ -89,7 +89,7 @@ class LiveSession:
         is_recorded: bool = False,
     ):
         self.hand: HandSettings = hand or HandSettings()
-        self.expert: Embodiment = build_arm(env.expert, env.limits, env.metric.links).embodiment
+        self.expert: Embodiment = env.build_arm("expert").embodiment
         self.settings: Settings = initial_settings(env)
         self.by_optimiser = mapper is None
         self._functions = FunctionCache(env, mapper)

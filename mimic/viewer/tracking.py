@@ -61,7 +61,7 @@ class Settings:
 
 def initial_settings(env: EnvConfig) -> Settings:
     """The settings of an environment."""
-    metric, locked = env.metric, build_arm(env.learner, env.limits).locked
+    metric, locked = env.metric, env.build_arm("learner").locked
     return Settings(locked, metric.correspondence, metric.translation, metric.rotation)
 
 
@@ -116,7 +116,7 @@ def home_angles(env: EnvConfig) -> Mapping[str, float]:
 
 def lock_angles(env: EnvConfig) -> Mapping[str, float]:
     """Angle at which each of the learner's joints is locked [rad]: that of the config, or else of the start pose."""
-    return {**home_angles(env), **build_arm(env.learner, env.limits).locked}
+    return {**home_angles(env), **env.build_arm("learner").locked}
 
 
 def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None = None) -> Iterator[CompiledFunctions]:
@@ -130,7 +130,7 @@ def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None 
     Raises:
       ValueError: the locked joints are invalid.
     """
-    expert = build_arm(env.expert, env.limits, env.metric.links).embodiment
+    expert = env.build_arm("expert").embodiment
     arm = learner_arm(env, settings.locked)
     learner = arm.embodiment
     metric = _metric_of_weights(env, settings, expert, learner)

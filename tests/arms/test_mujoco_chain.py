@@ -294,11 +294,11 @@ MODELS = {
         {},
         "expected a chain or a tree; .* number 1$",
     ),
-    "unknown base": (lambda: toy(TIP), {"base": "C"}, "the model has no body 'C'; valid are A, B$"),
+    "unknown base": (lambda: toy(TIP), {"base": "C"}, "base: expected a body of the model, A, B, got 'C'$"),
     "unknown tip": (
         lambda: toy(TIP),
         {"tip": "top"},
-        "the model has no body 'top'; valid are A, B, nor a site of that name; valid are tip$",
+        "tip: expected a body or site of the model, A, B, tip, got 'top'; did you mean tip.$",
     ),
     "no link": (lambda: model('<body><joint/><geom size="1"/></body>'), {}, "the arm has no link of a length above"),
     "names clash": (

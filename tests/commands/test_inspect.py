@@ -79,9 +79,13 @@ def test_an_equal_arm_reaches_the_poses_of_the_expert():
     ("arguments", "message"),
     [
         (["missing.xml"], "no MJCF or URDF file at '"),
-        (["arm.xml", "learner.locked=[shoulder]"], "unknown joint 'shoulder'; valid are pan, lift, elbow, wrist_1"),
-        (["arm.xml", "learner.tip=hand"], "the model has no body 'hand'; valid are table, pan_link"),
-        (["arm.xml", "expert=missing.urdf"], "no MJCF or URDF file at '"),
+        (
+            ["arm.xml", "learner.locked=[shoulder]"],
+            "learner.locked: unknown joint 'shoulder'; valid are pan, lift, elbow, wrist_1",
+        ),
+        (["arm.xml", "learner.tip=hand"], "learner.tip: expected a body or site of the model, table, pan_link"),
+        (["arm.xml", "expert=ur99"], "expert.model: expected panda, planar, panda_pair, an MJCF or URDF file"),
+        (["arm.xml", "expert=missing.urdf"], "expert: no MJCF or URDF file at '"),
     ],
 )
 def test_bad_input_of_an_inspection(reason, arm_file, arguments, message):
