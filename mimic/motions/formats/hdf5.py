@@ -15,7 +15,7 @@ from mimic.base.files import check_file, read_text
 from mimic.motions.formats.episodes import EXTRA, MAX_NUMBERS, Motion, Recording, follows
 from mimic.motions.formats.hdf5_objects import object_poses, skeleton
 from mimic.motions.formats.names import Selection, hand_position, is_command, parse_column, select
-from mimic.motions.formats.tables import is_time, seconds, unit_of_time
+from mimic.motions.formats.tables import is_time, line_of_rate, seconds, unit_of_time
 
 SUFFIXES = (".hdf5", ".h5")
 _EPISODE = re.compile(r"(demo|traj|trajectory|episode|ep|rollout|run)_?\d+", re.IGNORECASE)
@@ -75,11 +75,15 @@ def read_hdf5(path: Path, joints: Sequence[str], entry: str = "", rate: float | 
                 for name, episode in episodes(content):
                     layout = _layout(file, episode)
                     selection = selection or select(str(path), _entries(episode, layout), joints, entry, "data set")
+                    if rate and not motions and (name_of_times := _stated_times(episode, layout, rate)):
+                        selection.notes.append(line_of_rate(rate, name_of_times))
                     motion = _motion(episode, layout, selection, rate)
                     numbers += motion.qpos.size
                     if numbers > MAX_NUMBERS:
                         raise ValueError(f"expected at most {MAX_NUMBERS:,} numbers")
                     motions[episode_label(file, name, len(files))] = motion
+        except RecursionError as error:
+            raise ValueError(f"source: {str(file)!r} has too many levels of XML or JSON") from error
         except (OSError, KeyError, RuntimeError, TypeError, ValueError, ElementTree.ParseError) as error:
             line = " ".join(str(error).split())[:400]
             raise ValueError(
@@ -239,14 +243,24 @@ def _times(episode: Episode, count: int, layout: _Layout | None, rate: float | N
         states = _columns(episode.sets[STATES])[:, 0]
         if len(states) == count and np.all(np.diff(states) > 0):
             return states
-    for name, item in episode.sets.items() if rate is None else ():
-        column = parse_column(name.split("/")[-1])
-        if is_time(column) and item.shape in ((count,), (count, 1)):
-            return seconds(item.name, _columns(item)[:, 0], unit_of_time(column))[0]
+    for name, item in _sets_of_times(episode) if rate is None else ():
+        if item.shape in ((count,), (count, 1)):
+            return seconds(item.name, _columns(item)[:, 0], unit_of_time(parse_column(name.split("/")[-1])))[0]
     rates = [rate] if rate else [value for attributes in reversed(episode.attributes) for value in _rates(attributes)]
     if not rates:
         raise ValueError("it states no times: no data set time or timestamps; expected rate=, samples per second")
     return np.arange(count) / rates[0]
+
+
+def _sets_of_times(episode: Episode) -> list[tuple[str, Any]]:
+    return [(name, item) for name, item in episode.sets.items() if is_time(parse_column(name.split("/")[-1]))]
+
+
+def _stated_times(episode: Episode, layout: _Layout | None, rate: float) -> str:
+    """What states times other than those of a rate; empty where nothing does."""
+    names = [STATES] if layout else [name for name, _ in _sets_of_times(episode)]
+    others = {value for attributes in episode.attributes for value in _rates(attributes)} - {rate}
+    return names[0] if names else f"the attributes, {max(others):g}" if others else ""
 
 
 def _rates(attributes: Mapping[str, Any]) -> Iterator[float]:

@@ -81,8 +81,8 @@ def read_table(path: Path, joints: Sequence[str], rate: float | None = None) -> 
     time, line = np.arange(len(table)) / (rate or 1), ""
     if time_at is not None and not rate:
         time, line = seconds(path, table[:, time_at], unit_of_time(columns[time_at]))
-    elif time_at is not None:
-        line = f"times: {rate:g} samples a second, as rate= says, and not those of {content.names[time_at]}"
+    elif rate and time_at is not None:
+        line = line_of_rate(rate, content.names[time_at])
     qvel = _velocities(path, table, names[VELOCITY], selection)
     gripper = table[:, [angles[name] for name in selection.gripper]] if selection.gripper else None
     found = hand_position({"": list(angles)})
@@ -93,6 +93,11 @@ def read_table(path: Path, joints: Sequence[str], rate: float | None = None) -> 
     unit = common_unit(str(path), {name: columns[angles[name]].unit for name in selection.joints})
     lines = (*notes, *selection.notes, *filter(None, [line]))
     return Recording(motions, unit=unit, notes=lines, **selection.facts)
+
+
+def line_of_rate(rate: float, name: str) -> str:
+    """The line about times that the user's replace."""
+    return f"times: {rate:g} samples a second, as rate= says, and not those of {name}"
 
 
 def rows_of_table(path: Path, joints: int, timed: bool) -> tuple[Cells, list[str], list[str]]:

@@ -79,6 +79,22 @@ def test_observed_joints_are_read_with_their_gripper(tmp_path, content, attribut
     assert any("by their order" in line for line in recording.notes)
 
 
+@pytest.mark.parametrize(
+    ("content", "attributes", "rate", "stated"),
+    [
+        ({"demo_1/states": STATES}, {"demo_1": {"model_file": MODEL}}, 50.0, "states"),
+        (DROID, {}, 50.0, "observation/stamp_ms"),
+        (ACT, {"/": {"fps": 20}}, 50.0, "the attributes, 20"),
+        (ACT, {"/": {"fps": 20}}, 20.0, ""),
+        (ACT, {}, 50.0, ""),
+    ],
+)
+def test_a_rate_in_place_of_stored_times_is_a_line(tmp_path, content, attributes, rate, stated):
+    recording = read_hdf5(write(tmp_path / "a.hdf5", content, attributes), JOINTS, rate=rate)
+    lines = [line for line in recording.notes if line.startswith("times: ")]
+    assert lines == [f"times: {rate:g} samples a second, as rate= says, and not those of {stated}"] * bool(stated)
+
+
 def test_states_are_read_in_the_order_of_the_model(tmp_path):
     recording = read_hdf5(robosuite(tmp_path / "demo.hdf5"), JOINTS)
     assert list(recording.motions) == ["demo_1", "demo_2", "demo_10"] and recording.gripper == ("gripper0_finger",)
@@ -152,6 +168,16 @@ def test_an_empty_episode_is_left_out(tmp_path):
             "no element found|unclosed token|mismatched",
         ),
         ({"demo_0/states": STATES}, {"demo_0": {"model_file": "none.xml"}}, "No such file"),
+        (
+            {"demo_0/states": STATES},
+            {"demo_0": {"model_file": f"<mujoco>{2000 * '<worldbody>'}{2000 * '</worldbody>'}</mujoco>"}},
+            "has too many levels of XML or JSON",
+        ),
+        (
+            {"demo_0/qpos": ANGLES, "demo_0/actions": ANGLES},
+            {"/": {"fps": 20, "env_args": 20_000 * "[" + 20_000 * "]"}},
+            "has too many levels of XML or JSON",
+        ),
     ],
 )
 def test_files_that_cannot_be_read(tmp_path, content, attributes, message):
