@@ -93,15 +93,19 @@ def explain(error: Exception) -> str:
     if " not in " in message and isinstance(parent, DictConfig):
         names = [str(name) for name in parent if name != "hydra"]
         return f"unknown key {str(key)!r}; valid are {', '.join(names)}{_suggested_key(str(key), parent)}"
-    if wrong_type := re.fullmatch(r"Invalid type assigned: .* is not a subclass of .*\. value: (.*)", message):
-        return f"{key}: expected keys of its own, as in {key}.KEY=VALUE, got {wrong_type[1]!r:.80}"
-    return f"{key}: {message}" if key and str(key) not in message else message
+    of_key = f"{key}: " if key else ""
+    if "DictConfig with ListConfig" in message or "is not a ListConfig" in message:
+        return f"{of_key}expected a list where it is one, as in [VALUE], and else keys of its own"
+    if wrong_type := re.fullmatch(r"(?:Invalid type|Merge).* is not a subclass of (\w+)\. value: (.*)", message):
+        expected = f"keys of its own, as in {key}.KEY=VALUE" if key else f"the fields of {wrong_type[1]}"
+        return f"{of_key}expected {expected}, got {wrong_type[2]!r:.80}"
+    return message if str(key) in message else of_key + message
 
 
-def suggestion(name: str, valid: Iterable[str]) -> str:
+def suggestion(name: Any, valid: Iterable[str]) -> str:
     """The end of an error message about an unknown name: the valid name that is closest, if one is close."""
     close = {choice.lower(): choice for choice in valid}
-    matches = get_close_matches(name.lower(), close, n=1)
+    matches = get_close_matches(str(name).lower(), close, n=1)
     return f"; did you mean {close[matches[0]]}?" if matches and name else ""
 
 

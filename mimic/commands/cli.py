@@ -178,10 +178,12 @@ def expand_arguments(arguments: Sequence[str], command: str) -> list[str]:
     """Returns the arguments of a command in Hydra's syntax: its positional argument, keys of arms, and texts in quotes.
 
     Raises:
-      ValueError: see `expand_arms`.
+      ValueError: two positional arguments, or what `expand_arms` rejects.
     """
     words = zip(["", *arguments], arguments, strict=False)
     keyed = [word if option in _WITH_VALUE else _with_key(word, command) for option, word in words]
+    if len(given := [word for word, key in zip(arguments, keyed, strict=True) if word != key]) > 1:
+        raise ValueError(f"expected one argument without a key, got {' and '.join(given)}")
     return list(map(quoted, expand_arms(keyed, command)))
 
 

@@ -1,12 +1,14 @@
 """The imitation environments: `environments` lists their names, `env_config` is the config of one."""
 
 import importlib.resources
+import os
 from collections.abc import Mapping
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from mimic.arms.arm import ArmConfig
 from mimic.base import registry
 from mimic.base.config import check_choice, explain, merged, schema, suggestion, to_dict, typed
 from mimic.base.lazy import modules_of
@@ -43,7 +45,11 @@ def registered_preset(name: str) -> dict[str, Any]:
 
 def with_arm_configs(fields: Mapping[str, Any]) -> dict[str, Any]:
     """The fields of an environment, where an arm given by its name or file is a config of its own."""
-    arms = {key: {"model": fields[key]} for key in ("expert", "learner") if isinstance(fields.get(key), str)}
+    given = {key: fields[key] for key in ("expert", "learner") if key in fields}
+    for key, arm in given.items():
+        if not isinstance(arm, str | os.PathLike | Mapping | ArmConfig):
+            raise ValueError(f"{key}: expected an arm's name, its file or an ArmConfig, got {arm!r:.80}")
+    arms = {key: {"model": os.fspath(arm)} for key, arm in given.items() if isinstance(arm, str | os.PathLike)}
     return {**fields, **arms}
 
 

@@ -48,7 +48,7 @@ class DemonstrationConfig:
     seed: int = number(0, at_least=0, at_most=2**63 - 1)
 
     def __post_init__(self) -> None:
-        check_choice("demonstrations.kind", self.kind, (*KINDS, MIXED))
+        check_choice("kind", self.kind, (*KINDS, MIXED))
         check_ranges(self, "demonstrations.")
 
 

@@ -33,12 +33,12 @@ from mimic.metric.distance import (
     RotationMeasure,
     Weights,
     adaptive_weights,
+    check_matrix,
 )
 from mimic.metric.hand import NO_HAND, HandWeights
 
 CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft")
 SOFT_SHARPNESS = -10.0  # xi of the correspondence "soft"
-_MAX_MATRIX = 1e6  # value of a registered matrix
 registry.reserve("correspondence", CORRESPONDENCES)
 
 
@@ -176,13 +176,9 @@ def _checked_matrix(
             f"({', '.join(expert.link_names)}) and a column for each learner link ({', '.join(learner.link_names)}), "
             f"got {list(values.shape)}"
         )
-    if values.dtype.kind not in "biuf" or not np.all(np.isfinite(values)):
-        raise ValueError(f"correspondence: {label}: expected finite numbers")
-    if values.min() < 0 or not 0 < values.max() <= _MAX_MATRIX:
-        raise ValueError(
-            f"correspondence: {label}: expected numbers from 0 to {_MAX_MATRIX:g}, not all of them 0, got "
-            f"{values.min():g} to {values.max():g}"
-        )
+    check_matrix(f"correspondence: {label}", values)
+    if not values.any():
+        raise ValueError(f"correspondence: {label}: expected numbers above 0, got zeros alone")
     return values.astype(float)
 
 

@@ -25,6 +25,7 @@ Reduction = Literal["mean", "frobenius"]
 ROTATION_MEASURES = ("cosine", "angle")
 REDUCTIONS = ("mean", "frobenius")
 
+_MAX_MATRIX = 1e6  # value of a correspondence
 PARTS = ("translation", "rotation", "linear_velocity", "angular_velocity")
 
 
@@ -154,7 +155,7 @@ class Metric:
       hand_weights: of the distance of the hands, which is added, see `hand_distance`.
 
     Raises:
-      ValueError: an unknown rotation measure or reduction, or a weight out of range.
+      ValueError: an unknown rotation measure or reduction, or an entry of W or a weight out of range.
     """
 
     correspondence: Correspondence
@@ -166,6 +167,8 @@ class Metric:
     def __post_init__(self) -> None:
         check_choice("rotation", self.rotation, ROTATION_MEASURES)
         check_choice("reduction", self.reduction, REDUCTIONS)
+        if not callable(self.correspondence) and not isinstance(self.correspondence, Tracer):
+            check_matrix("correspondence", np.asarray(self.correspondence))
         _check_weights(self.weights)
         check_ranges(self.hand_weights, "hand_weights.")
 
@@ -307,6 +310,16 @@ def _weight(part: str, value: Any, distances: Array) -> Any:
             f"weights: expected {part} to broadcast to {distances.shape} (expert links, learner links), "
             f"got shape {weight.shape}"
         ) from None
+
+
+def check_matrix(name: str, matrix: np.ndarray) -> None:
+    """Raises a ValueError that starts with the name for a W of anything but finite numbers from 0 on."""
+    if matrix.dtype.kind not in "biuf" or not np.all(np.isfinite(matrix)):
+        raise ValueError(f"{name}: expected finite numbers")
+    if np.any(matrix < 0) or np.any(matrix > _MAX_MATRIX):
+        raise ValueError(
+            f"{name}: expected numbers from 0 to {_MAX_MATRIX:g}, got {matrix.min():g} to {matrix.max():g}"
+        )
 
 
 def _check_weights(weights: Any) -> None:

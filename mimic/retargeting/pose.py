@@ -346,11 +346,13 @@ def checked_poses(
       axes: names of the required axes before that of the joints.
 
     Raises:
-      ValueError: the shape is not [..., *axes, joints], or an angle is not finite.
+      ValueError: the shape is not [..., *axes, joints], there is no pose, or an angle is not finite.
     """
     if poses.ndim <= len(axes) or poses.shape[-1] != arm.num_joints:
         shape = ", ".join(["...", *axes, str(arm.num_joints)])
         raise ValueError(f"{name}: expected shape [{shape}] for {arm.name}, got {poses.shape}")
+    if not poses.size:
+        raise ValueError(f"{name}: expected one pose or more, got shape {poses.shape}")
     poses = poses if jnp.issubdtype(poses.dtype, jnp.floating) else poses.astype(float)
     if not isinstance(poses, Tracer) and not np.all(np.isfinite(np.asarray(poses))):
         raise ValueError(f"{name}: expected finite angles [rad], got some that are not")

@@ -18,6 +18,7 @@ from tests.helpers.repository import REPOSITORY
     ("arguments", "message"),
     [
         (["env.world.payload=[0,1]"], "env.world.payload: expected with an inner loop, as in world=ideal"),
+        (["env.observation=[twist]"], "env.observation: expected a list where it is one, as in [VALUE], and else keys"),
         (["seed=one"], "could not be converted to Integer"),
         (["+foo=1"], "foo"),
         (["trainer=pose_mapper", "trainer.num_envs=8"], "unknown key 'trainer.num_envs'; valid are name, preset"),

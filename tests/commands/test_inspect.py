@@ -78,6 +78,7 @@ def test_an_equal_arm_reaches_the_poses_of_the_expert():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["arm.xml", "arm.xml"], "expected one argument without a key, got "),
         (["missing.xml"], "no MJCF or URDF file at '"),
         (
             ["arm.xml", "learner.locked=[shoulder]"],

@@ -207,7 +207,9 @@ def test_training_and_held_out_demonstrations_differ():
         ({"limits": "soft"}, "expected one of none, hardware"),
         ({"demonstrations": {"kind": "dance"}}, "expected one of computed_torque, pid, reach, splines, steps, mixed"),
         ({"metric": {"rotation": -1.0}}, "metric.rotation: expected a number from 0 to 1e.06, got -1.0"),
-        ({"learner": {"locked": [9]}}, "unknown joint 9"),
+        ({"learner": {"locked": [9]}}, "learner.locked: unknown joint 9"),
+        ({"learner": 3}, "learner: expected an arm's name, its file or an ArmConfig, got 3"),
+        ({"observation": [1]}, "expected the fields of ObservationConfig, got"),
     ],
 )
 def test_bad_overrides_are_rejected(overrides, message):

@@ -224,6 +224,14 @@ def test_weights_out_of_range_are_rejected(weights, message):
         Metric(np.ones((3, 2)), **options)
 
 
+@pytest.mark.parametrize(
+    ("matrix", "message"), [(-np.eye(2), "numbers from 0 to"), (np.full((3, 2), np.nan), "finite"), (None, "finite")]
+)
+def test_a_correspondence_of_other_than_finite_numbers_is_rejected(matrix, message):
+    with pytest.raises(ValueError, match=f"^correspondence: expected {message}"):
+        Metric(matrix, PAPER_WEIGHTS)
+
+
 def test_link_distances_have_the_same_rule():
     with pytest.raises(ValueError, match="weights.rotation: expected a number from 0"):
         link_distances(states(EXPERT), states(LEARNER), DistanceWeights(rotation=-1.0))

@@ -184,6 +184,7 @@ def test_trajectories_do_not_jump(metric, limits):
     [
         (np.zeros(6), {}, r"qpos: expected shape \[..., 7\] for planar7, got \(6,\)"),
         (np.full(7, np.nan), {}, "qpos: expected finite angles"),
+        (np.zeros((0, 7)), {}, "qpos: expected one pose or more"),
         (np.zeros(7), {"method": "magic"}, "method: expected one of newton, gradient_descent, got 'magic'"),
         (np.zeros(7), {"starts": -1}, "starts, iterations"),
         (np.zeros(7), {"hand": "near"}, "hand: expected one of free, exact, got 'near'"),
