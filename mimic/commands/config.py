@@ -321,6 +321,8 @@ class InspectConfig:
         _ = base_numbers(self.base)
         if self.clip:
             check_unused(self, ("out", "base"), "with clip=, whose arms `mimic.view source=` shows")
+        else:
+            check_unused(self, ("capture",), "without clip=FILE")
         if self.base != "same" and not self.bound:
             raise ValueError("base: expected none with bound=false, which compares no hands")
 

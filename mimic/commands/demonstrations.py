@@ -48,7 +48,7 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
         arm = build_arm(env.expert, env.limits)
     if config.source:
         return _prepare_import(config, env, arm, out, plot)
-    check_unused(config, _OF_SOURCE, "without source=FILE")
+    check_unused(config, (*_OF_SOURCE, "arm", "capture"), "without source=FILE")
     demonstrations, redrawn = _record(arm, env, console)
     check_effort(demonstrations, arm.embodiment)  # of the exact arrays to be written
 
@@ -70,6 +70,7 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
 def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path, plot: Path) -> Callable[[], None]:
     """Imports motions; the returned function writes and plots them."""
     check_unused(config, ("kind", "count", "seed"), _NOT_RECORDED)
+    check_unused(config, ("capture",), "with a source of joint angles")
     source = Path(config.source).expanduser()
     model = arm if env.limits == "hardware" else build_arm(dataclasses.replace(env.expert, home=None), "hardware")
     try:

@@ -194,14 +194,13 @@ def read_source(source: Path, names: Sequence[str], topic: str, rate: float | No
     """The motions of a file or a folder, as it has them; see `read_recording`."""
     if rate is not None and not rate > 0:
         raise ValueError(f"rate: expected samples per second, above 0, got {rate:g}")
-    if is_lerobot(source):
-        return read_lerobot(source, names, topic)
-    if is_rosbag2(source):
-        return read_rosbag2(source, names, topic)
+    read_timed = read_lerobot if is_lerobot(source) else read_rosbag2 if is_rosbag2(source) else None
+    if rate and (read_timed or not (is_hdf5(source) or source.name.lower().endswith(TABLES))):
+        raise ValueError(f"rate: expected only for tables and HDF5 files, got {rate:g} for {str(source)!r}")
+    if read_timed:
+        return read_timed(source, names, topic)
     if is_hdf5(source):
         return read_hdf5(source, names, topic, rate)
-    if rate and not source.name.lower().endswith(TABLES):
-        raise ValueError(f"rate: expected only for tables and HDF5 files, got {rate:g} for {str(source)!r}")
     if topic:
         raise ValueError(
             f"topic: expected only for a LeRobot dataset, a rosbag2 or HDF5 files, got {topic!r} for {str(source)!r}"

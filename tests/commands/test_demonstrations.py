@@ -41,6 +41,8 @@ def test_the_command_records_what_the_library_does(tmp_path):
             ["out=new.npz", "source={folder}"],
             "expected a folder of a LeRobot dataset, of rosbag2 or HDF5 files, or of one table",
         ),
+        (["out=new.npz", "arm=left"], "arm: expected none without source=FILE"),
+        (["out=new.npz", "source={csv}", "capture.yaw=90"], "capture: expected none with a source of joint angles"),
         (["out=new.npz", "source={csv}", "topic=/a"], "topic: expected only for a LeRobot dataset, a rosbag2 or HDF5"),
         (["out=new.npz", "topic=/a"], "topic: expected none without source="),
         (["out=new.npz", "joints=[a]"], "joints: expected none without source=FILE"),

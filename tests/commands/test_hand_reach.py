@@ -81,6 +81,7 @@ def test_without_such_a_pose_there_is_no_number(arm):
         (["panda", "base=[0,1]"], "base: expected same, auto or [x,y,z,yaw], got [0, 1]"),
         (["panda", "base=[0,0,0,90]"], "base: expected a yaw of at most 2 pi rad, got 90"),
         (["panda", "base=auto", "bound=false"], "base: expected none with bound=false, which compares no hands"),
+        (["panda", "capture.yaw=90"], "capture: expected none without clip=FILE"),
         (["clip.bvh", "out=pictures"], "out: expected none with clip="),
     ],
 )

@@ -8,6 +8,7 @@ import pytest
 
 from mimic.motions.formats.lerobot import write_lerobot
 from mimic.motions.formats.lerobot_reading import is_lerobot, read_lerobot
+from mimic.motions.importing import read_source
 from tests.helpers.episodes import DT, EXPERT, LEARNER, STEPS, episodes, motions
 
 pa = pytest.importorskip("pyarrow")
@@ -63,6 +64,11 @@ def test_datasets_of_others_are_read(tmp_path, names):
     np.testing.assert_array_equal(second.qpos, state[1][:, ::-1])
     np.testing.assert_allclose(second.time, np.arange(STEPS) / 20, atol=1e-12)  # exact multiples
     assert first.qvel is None
+
+
+def test_a_rate_without_effect_is_rejected(written):
+    with pytest.raises(ValueError, match="rate: expected only for tables and HDF5 files"):
+        read_source(written, EXPERT, "", 10.0)
 
 
 def test_datasets_of_version_2_have_a_file_for_each_episode(tmp_path):
