@@ -13,6 +13,7 @@ from mimic.envs.config import OBSERVATION_TERMS, REWARD_TERMS
 from mimic.envs.start_poses import CLEARANCE
 from mimic.metric.capsule_distances import capsule_axes, intrusion, pair_distances
 from mimic.metric.kinematics import LinkStates, link_states
+from mimic.metric.motion_distance import gradient_by_learner
 
 Env = Any  # an `ImitationEnv`, which imports this module
 
@@ -120,11 +121,7 @@ def distance_gradient(env: Env, state: ArmState) -> Float[Array, " 2*joints"]:
     It says which way each joint should move. Without it a policy learns the kinematics of the learner from rewards.
     """
     expert_states = env.expert_at(state.demonstration, state.step + 1)
-
-    def distance(qpos: Array, qvel: Array) -> Array:
-        return env.states_distance(expert_states, link_states(env.learner, qpos, qvel))
-
-    return jnp.concatenate(jax.grad(distance, argnums=(0, 1))(state.qpos, state.qvel))
+    return gradient_by_learner(env.metric, env.learner, expert_states, state.qpos, state.qvel)
 
 
 _BUILT_IN_OBSERVATION_TERMS: dict[str, ObservationTerm] = dict(
