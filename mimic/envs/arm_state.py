@@ -1,5 +1,8 @@
 """The state of an episode, which a brax state carries."""
 
+import mimic.base.quiet_mjx  # noqa: F401  # before brax
+
+# isort: split
 from typing import cast
 
 from brax.envs.base import State

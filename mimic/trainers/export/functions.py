@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from mimic.arms.embodiment import Embodiment
 from mimic.base.distribution import VERSION
-from mimic.envs.imitation import layout_of, observation_layout, torque_scale
+from mimic.envs.imitation import layout_of, torque_scale
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.pose_mapper.mapper import PoseMapper
@@ -57,14 +57,12 @@ def make_function(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFu
 def _policy(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFunction:
     arms = trained.env.build_arms()
     expert, learner = map(trained.env.metric.compared, arms.embodiments)
-    if trained.env.observation.terms or trained.env.environment:
-        layout = layout_of(run_environment(trained.env, run_dir)[0])
-    else:
-        layout = observation_layout(expert, learner, trained.env.preview)
-    size = layout[-1]["stop"]
+    env = run_environment(trained.env, run_dir)[0]
+    layout, size = layout_of(env), env.observation_size
     config = cast(PPOConfig, trained.trainer)
-    params = load_checkpoint(run_dir, ppo.params_template(config, size, learner.num_joints), steps)[1]
-    controller = ppo.make_controller(config, size, learner.num_joints)(jax.device_get(params))
+    template = ppo.params_template(config, size, env.action_size, env.privileged_size)
+    params = load_checkpoint(run_dir, template, steps)[1]
+    controller = ppo.make_controller(config, size, env.action_size)(jax.device_get(params))
     scale = jnp.asarray(torque_scale(arms.learner, trained.env.action_scale, trained.env.control_dt))
 
     def function(observation: jax.Array) -> dict[str, jax.Array]:

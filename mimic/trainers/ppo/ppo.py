@@ -140,7 +140,7 @@ def initial_params(networks: ppo_networks.PPONetworks, observation_size: int, ke
     return statistics, networks.policy_network.init(key_policy), networks.value_network.init(key_value)
 
 
-def params_template(config: PPOConfig, observation_size: int, action_size: int, privileged_size: int = 1) -> Params:
+def params_template(config: PPOConfig, observation_size: int, action_size: int, privileged_size: int) -> Params:
     """The shapes of the parameters, with the structure of a checkpoint; see `make_networks`."""
     networks = make_networks(config, observation_size, action_size, privileged_size)
     return jax.eval_shape(lambda: initial_params(networks, observation_size, jax.random.PRNGKey(0)))

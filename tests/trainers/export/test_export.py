@@ -20,9 +20,10 @@ from mimic.trainers.export.export_controller import prepare_controller
 from mimic.trainers.pose_mapper.mapper import PoseMapper
 from mimic.trainers.pose_mapper.model import make_model
 from mimic.trainers.ppo.ppo import initial_params, make_controller, make_networks
-from mimic.trainers.run_config import save_config
+from mimic.trainers.run_config import load_config, save_config
 from tests.helpers.metric_cases import random_poses
 from tests.helpers.tiny import SHORT_ARMS
+from tests.helpers.untrained_run import untrained_run
 
 pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -32,10 +33,10 @@ TOLERANCE = 1e-5  # rad, or a fraction of the maximum torque: float32, sums in a
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
     """The environment and the policy of a run with random weights and observation statistics, and its export."""
-    run_dir = tmp_path_factory.mktemp("policy") / "run"
     env = mimic.make("panda4dof", demonstrations={"count": 1, "held_out": 1})
-    config = PPOConfig(hidden_layers=[16, 8]).resolve("cpu")
-    networks = make_networks(config, env.observation_size, env.action_size)
+    run_dir = untrained_run(tmp_path_factory.mktemp("policy") / "run", env.config)
+    config = load_config(run_dir).trainer
+    networks = make_networks(config, env.observation_size, env.action_size, env.privileged_size)
     statistics, *networks = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))
     rng = np.random.default_rng(0)
     statistics = statistics.replace(
@@ -43,8 +44,6 @@ def policy(tmp_path_factory):
         std=jnp.asarray(rng.uniform(0.3, 2, env.observation_size), jnp.float32),
     )
     params = (statistics, *networks)
-    run_dir.mkdir()
-    save_config(run_dir, TrainConfig(env.config, config))
     save_checkpoint(run_dir, 7, params)
     controller = make_controller(config, env.observation_size, env.action_size)(params)
     return env, controller, session_of(mimic.export_run(run_dir, run_dir.parent / "policy.onnx"))
