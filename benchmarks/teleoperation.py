@@ -48,8 +48,7 @@ from mimic.retargeting.hand_target import placement
 from mimic.retargeting.self_contacts import SelfContacts
 
 EPISODES = (
-    "method rate frames position_mm_p95:.2f hand_direction_deg:.2f bound:.1% of_limits:.3f stalled_s:.2f elbow:.3f "
-    "plane_deg:.1f"
+    "method rate frames position_mm_p95:.2f hand_direction_deg:.2f bound:.1% of_limits:.3f elbow:.3f plane_deg:.1f"
 )
 SWEEPS = "pair steps not_finite beyond_mrad:.6f of_limits:.4f recovery_s:.2f holding:.1% clearance_mm:.1f"
 POSTURES = (
@@ -71,8 +70,7 @@ BASE = [0.0, 0.115, 0.03, -0.535]  # of the Piper in the SO-101's base frame, fr
 PAIRS = ("panda-ur5e", "ur5e-panda", "so101-panda", "panda-so101", "person-panda")
 FAULTS = ("lost", "stalled", "jumped", "displaced", "not finite", "backwards")
 REDUNDANT = ("iiwa", "kinova3", "jaco")  # followers of a Panda
-_RATE, _LOST = 100.0, 0.3  # Hz; fraction of samples that are lost
-_TIMED = 3  # episodes
+_RATE, _LOST, _TIMED = 100.0, 0.3, 3  # Hz; fraction of samples that are lost; episodes
 
 
 def config(name: str, options: argparse.Namespace) -> ArmConfig:
@@ -180,7 +178,7 @@ def episodes(options: argparse.Namespace) -> Iterator[Row]:
             row |= hand_errors(leader, follower, base, qpos, own) | resemblance(leader, follower, base, qpos, own)
             if mine:
                 row |= {"bound": within[: len(qpos[judged])].mean(), "violations": sum(x[2] for x in of_limits)}
-                row |= {"of_limits": max(x[0] for x in of_limits), "stalled_s": stalled(runs, paths, rate)}
+                row |= {"of_limits": max(x[0] for x in of_limits)}
             yield as_numbers(row)
 
 
@@ -213,18 +211,6 @@ def hand_errors(leader: Embodiment, follower: Embodiment, base: Any, qpos: np.nd
         "position_mm_p95": np.percentile(apart, 95),
         "hand_direction_deg": np.degrees(np.arccos(cosine)).mean(),
     }
-
-
-def stalled(runs: list[np.ndarray], paths: list[np.ndarray], rate: float) -> float:
-    """The longest time in which the leader moves all the while and the follower does not [s]."""
-    longest = 0
-    for run, path in zip(runs, paths, strict=True):
-        moves, stands = (np.abs(np.diff(x, axis=0)).max(axis=1) * rate for x in (path, run))
-        count = 0
-        for stalls in (moves > 0.1) & (stands < 1e-3):
-            count = count + 1 if stalls else 0
-            longest = max(longest, count)
-    return longest / rate
 
 
 def wander(leader: Embodiment, steps: int, rng: np.random.Generator) -> np.ndarray:
@@ -384,9 +370,8 @@ def main() -> None:
         pairs=PAIRS,
         steps=20000,
         episodes=55,
+        **dict.fromkeys(("data", "robots", "clip"), Path),
     )
-    for name in ("data", "robots", "clip"):
-        parser.add_argument(f"--{name}", type=Path)
     options = parser.parse_args()
     parts: dict[str, tuple[str, Callable[[], Iterator[Row]]]] = {
         "episodes": (EPISODES, lambda: episodes(options)),

@@ -3,7 +3,6 @@
 python -m benchmarks.figures.doors WORK --out docs/images
 """
 
-import argparse
 import json
 from pathlib import Path
 
@@ -13,6 +12,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 
+from benchmarks.common.parser import make_parser  # noqa: E402
 from benchmarks.transfer import ARMS  # noqa: E402
 
 _DT, _OPEN = 0.05, 0.3  # s; rad, from which robosuite counts the door as open
@@ -39,10 +39,8 @@ def plot_doors(work: Path, out: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser("python -m benchmarks.figures.doors", description=__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser = make_parser("figures.doors", __doc__, out="DIR")
     parser.add_argument("work", type=Path)
-    parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args(arguments)
     plot_doors(options.work, options.out)
 
