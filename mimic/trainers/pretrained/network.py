@@ -136,7 +136,7 @@ def policy_template(config: TrainConfig) -> tuple[Any, Any]:
     from mimic.trainers.ppo import ppo
 
     observation_size, joints = _policy_sizes(config)
-    return ppo.params_template(cast(PPOConfig, config.trainer), observation_size, joints)[:2]
+    return ppo.params_template(cast(PPOConfig, config.trainer), observation_size, joints, 0)[:2]  # any critic
 
 
 def _policy_sizes(config: TrainConfig) -> tuple[int, int]:
