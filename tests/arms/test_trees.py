@@ -65,7 +65,7 @@ def test_the_chain_length_is_that_of_the_longest_chain():
     [
         ([], "tip: expected one name or more"),
         (["left_hand", "left_hand"], "tip: expected tips on different bodies"),
-        (["left_hand", "nose"], "no body 'nose'"),
+        (["left_hand", "nose"], "tip: expected a body or site of the model, .*, got 'nose'"),
         (["left_hand", "stand"], "no revolute joint between base and tip"),
     ],
 )
