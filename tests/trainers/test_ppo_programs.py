@@ -243,7 +243,7 @@ def test_a_restored_state_needs_the_same_compiled_epoch(monkeypatch):
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1, hidden_layers=[8]).resolve("cpu")
     lowered = []
     monkeypatch.setattr(ppo, "in_background", lambda compiled: lowered.append(compiled.__self__.as_text()))
-    networks = ppo.make_networks(config, env.observation_size, env.action_size)
+    networks = ppo.make_networks(config, env.observation_size, env.action_size, env.privileged_size)
     params = jax.device_get(ppo.initial_params(networks, env.observation_size, jax.random.PRNGKey(0)))
     for initial in (None, params):
         ppo.compile_training(env, config, 1, initial, restored=True)
