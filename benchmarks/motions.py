@@ -7,7 +7,7 @@ RUN is a run directory of `python -m mimic.train`; runs that differ in nothing b
 - test: the test set of the runs' environment, `--count` motions of each kind.
 - new: kinds that no training has. "circle": the hand draws a circle. "figure_eight": two joints move as sines of one
   and of two periods. "backwards": splines played backwards. "person": `--person FILE`, demonstrations of the runs'
-  expert, from `python -m mimic.retarget`. The learner starts in the pose nearest to the first one of each.
+  expert, from `python -m mimic.retarget`.
 - long: 30 s of splines and of steps; the gap in the first and in the last 5 s.
 
 "whole_motion" is not a controller but a search: the torques of the policy's first seed, improved by iLQR with the whole
@@ -122,35 +122,31 @@ def _from_paths(arm: Arm, qpos: np.ndarray, dt: float, kind: str) -> Demonstrati
     return Demonstrations(qpos, qvel, qpos[:, -1], dt, *names, kinds=(kind,) * len(qpos))
 
 
-def motions(name: str, config: TrainConfig, count: int, person: Path | None) -> Iterator[tuple[str, Demonstrations]]:
-    """The sets of motions, each with where the learner starts them."""
+def motions(name: str, config: TrainConfig, count: int, person: Path | None) -> Iterator[Demonstrations]:
+    """The sets of motions."""
     env, expert = config.env, config.env.build_arms().expert
     if name == "test":
-        yield "home", test_motions(env, count)
+        yield test_motions(env, count)
     elif name == "long":
         for kind in ("splines", "steps"):
-            yield (
-                "home",
-                recorded_demonstrations(
-                    dataclasses.replace(env, horizon=LONG), expert, max(1, count // 8), kind=kind, test=True
-                ),
-            )
+            longer = dataclasses.replace(env, horizon=LONG)
+            yield recorded_demonstrations(longer, expert, max(1, count // 8), kind=kind, test=True)
     else:
         few, horizon, dt = max(1, count // 4), env.horizon, env.control_dt
-        yield "nearest", backwards(recorded_demonstrations(env, expert, few, kind="splines", test=True))
-        yield "nearest", circles(expert, few, horizon, dt)
-        yield "nearest", figures_of_eight(expert, few, horizon, dt)
+        yield backwards(recorded_demonstrations(env, expert, few, kind="splines", test=True))
+        yield circles(expert, few, horizon, dt)
+        yield figures_of_eight(expert, few, horizon, dt)
         if person is not None:
             loaded = load_demonstrations(person)
-            yield "nearest", dataclasses.replace(loaded, kinds=("person",) * loaded.count)
+            yield dataclasses.replace(loaded, kinds=("person",) * loaded.count)
 
 
-def rows(name: str, start: str, unseen: Demonstrations, policies: list[tuple[Path, TrainConfig]],
+def rows(name: str, unseen: Demonstrations, policies: list[tuple[Path, TrainConfig]],
          controllers: list[str]) -> Iterator[Row]:  # fmt: skip
     """Rows of the policy of several seeds, and of each controller, on a set of motions."""
     run, config = policies[0]
     settings = dataclasses.replace(cast(PPOConfig, config.trainer), crossovers=0)  # none is evaluated
-    config = dataclasses.replace(config, env=dataclasses.replace(config.env, start=start), trainer=settings)
+    config = dataclasses.replace(config, trainer=settings)
     trainer = make_ppo_trainer(config, run, unseen, None)
     evaluator = trainer.evaluator
     part = evaluator.parts["held_out"]
@@ -249,8 +245,8 @@ def main() -> None:
     def measured() -> Iterator[Row]:
         for policies in policies_of(options.runs):
             for name in options.sets:
-                for start, unseen in motions(name, policies[0][1], options.count, options.person):
-                    yield from rows(name, start, unseen, policies, options.controllers)
+                for unseen in motions(name, policies[0][1], options.count, options.person):
+                    yield from rows(name, unseen, policies, options.controllers)
 
     collect(options, measured(), "rows", COLUMNS)
 

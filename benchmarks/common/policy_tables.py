@@ -96,12 +96,15 @@ def unseen_motions(motions: Results) -> list[Cells]:
     return rows
 
 
-def motions_from_anywhere(elsewhere: Results) -> list[Cells]:
-    """Mean distance above the bound, in thousandths, on motions that start anywhere, by environment and kind."""
-    rows: list[Cells] = [("joints", "motions", *elsewhere["rows"][0]["excess"])]
-    for row in elsewhere["rows"]:
-        cells = ("" if value is None else f"{1000 * value:.1f}" for value in row["excess"].values())
-        rows.append((ENVIRONMENTS[row["env"]].split()[-1], row["kind"].replace("_", " "), *cells))
+def motions_from_anywhere(motions: Results) -> list[Cells]:
+    """Mean distance above the bound, in thousandths, on kinds of motions that no training has, by environment."""
+    names = "policy", "copy_joints", "one_step", "nearest_pose", "computed_torque"
+    rows: list[Cells] = [("joints", "motions", "holding still", "policy", *(f"`{name}`" for name in names[1:]))]
+    new = where(motions["rows"], set="new")
+    for env, kind in dict.fromkeys((row["env"], row["kind"]) for row in new):
+        of_kind = {row["controller"]: row for row in where(new, env=env, kind=kind)}
+        excess = of_kind["policy"]["excess_of_holding"], *(of_kind[name]["excess"] for name in names)
+        rows.append((ENVIRONMENTS[env].split()[-1], kind.replace("_", " "), *(f"{1000 * x:.1f}" for x in excess)))
     return rows
 
 

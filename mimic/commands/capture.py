@@ -15,7 +15,7 @@ from mimic.base.overrides import setting, shell_words
 from mimic.commands.config import CaptureConfig, RecordingConfig
 from mimic.commands.demonstrations_plot import plot_demonstrations
 from mimic.commands.printed import train_command
-from mimic.envs.config import DemonstrationConfig, EnvConfig, ObservationConfig, RewardConfig
+from mimic.envs.config import DemonstrationConfig, EnvConfig, RewardConfig
 from mimic.metric.kinematics import link_state_table
 from mimic.motions.mocap.arms import find_arms, find_facing, unnamed
 from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
@@ -174,17 +174,15 @@ def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Pa
 
 
 def training_env(env: EnvConfig, expert: ArmConfig, demonstrations: DemonstrationConfig) -> EnvConfig:
-    """The environment of a training on a person's motion; a robot starts in its ready pose, and must not touch itself.
+    """The environment of a training on a person's motion; a robot must not touch itself.
 
     Args:
       env: environment with the learner.
       expert: the person's arm.
       demonstrations: its motion.
     """
-    changes: dict[str, Any] = {"reward": RewardConfig({"self_collision": 2.0})}
-    if env.kind != "inner_loop":
-        changes = {"start": "nearest", "observation": ObservationConfig(["distance_gradient"])}
-    return dataclasses.replace(env, expert=expert, demonstrations=demonstrations, **changes)
+    reward = RewardConfig({"self_collision": 2.0}) if env.kind == "inner_loop" else env.reward
+    return dataclasses.replace(env, expert=expert, demonstrations=demonstrations, reward=reward)
 
 
 def prepare_capture_inspection(source: Path, config: CaptureConfig) -> Callable[[], None]:

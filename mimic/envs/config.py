@@ -9,7 +9,6 @@ from mimic.base import registry
 from mimic.base.config import check_choice
 from mimic.base.ranges import check_ranges, number
 from mimic.control.joint_control import MODES
-from mimic.envs.start_poses import START_POSES
 from mimic.metric.config import MetricConfig
 from mimic.motions.experts import KINDS, MIXED
 from mimic.physics.world import AUTO, PHYSICS, RandomizationConfig, WorldConfig
@@ -74,13 +73,15 @@ class ObservationConfig:
 
     Attributes:
       terms: names of observation terms, in the order of their numbers, after the link states: "distance_gradient",
-        which is built in, or what `mimic.register` adds.
+        which is built in, or what `mimic.register` adds; an empty list is the paper's. Null is "distance_gradient" in
+        an environment of the kind "one_arm", and nothing in others.
     """
 
-    terms: list[str] = dataclasses.field(default_factory=list)
+    terms: list[str] | None = None
 
     def __post_init__(self) -> None:
-        repeated = sorted({name for name in self.terms if self.terms.count(name) > 1})
+        terms = self.terms or []
+        repeated = sorted({name for name in terms if terms.count(name) > 1})
         if repeated:
             raise ValueError(f"observation.terms: expected each term once, got {repeated[0]!r:.80} twice")
 
@@ -143,8 +144,6 @@ class EnvConfig:
         ranges).
       metric: embodiment distance of the reward.
       demonstrations: motions to imitate.
-      start: where the learner starts an episode, at rest: "home", in its home pose (paper); or "nearest", in the pose
-        nearest to the expert's first one, for demonstrations that start anywhere; crossovers then do, too.
       horizon: control steps of an episode.
       control_dt: duration of a control step [s]; the torque is constant within it.
       substeps: physics steps in a control step; with an inner loop there is one for each of its periods of 1 ms.
@@ -171,7 +170,6 @@ class EnvConfig:
     limits: str = "none"
     metric: MetricConfig = dataclasses.field(default_factory=MetricConfig)
     demonstrations: DemonstrationConfig = dataclasses.field(default_factory=DemonstrationConfig)
-    start: str = "home"
     horizon: int = number(50, at_least=1, at_most=10_000)
     control_dt: float = number(0.1, at_least=1e-4, at_most=10.0)  # robots are controlled at 10 kHz at most
     substeps: int = number(10, at_least=1, at_most=1000)  # 0.1 ms for the default control step
@@ -190,14 +188,13 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         check_choice("limits", self.limits, LIMITS)
-        check_choice("start", self.start, START_POSES)
         check_choice("physics", self.physics, (AUTO, *PHYSICS))
         check_choice("control", self.control, MODES)
         check_ranges(self)
         self._check_applies()
         for name in self.reward.terms:
             registry.check("reward_term", name, "reward.terms")
-        for name in self.observation.terms:
+        for name in self.observed_terms:
             registry.check("observation_term", name, "observation.terms")
         if self.environment:
             registry.check("environment", self.environment, "environment")
@@ -230,6 +227,13 @@ class EnvConfig:
         if self.arms is not None:
             return "sampled_arms"
         return "one_arm" if self.world is None else "inner_loop"
+
+    @property
+    def observed_terms(self) -> list[str]:
+        """Names of the observation terms."""
+        if self.observation.terms is None:
+            return list(OBSERVATION_TERMS) if self.kind == "one_arm" else []
+        return self.observation.terms
 
     @property
     def recording_substeps(self) -> int:

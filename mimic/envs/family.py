@@ -66,7 +66,6 @@ def check_family(config: EnvConfig) -> None:
     """Raises a ValueError for settings that an environment of many arms does not have."""
     supported = {
         "physics": ("auto", "fused"),
-        "start": ("home",),
         "preview": (1,),
         "randomization": (RandomizationConfig(),),
         "reward": (RewardConfig(),),

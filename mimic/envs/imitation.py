@@ -25,7 +25,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.base import compat, registry
 from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig
-from mimic.envs.start_poses import home_poses, nearest_poses
+from mimic.envs.start_poses import start_poses
 from mimic.envs.terms import ObservationTerm, Transition, observation_terms, observed, reward_terms
 from mimic.metric.capsule_distances import changing_pairs
 from mimic.metric.distance import LinkDistance, Metric
@@ -85,7 +85,7 @@ class ImitationEnv(Env):
         compat.mend_brax()  # here: brax's trainers take any environment, wrapped by any function
         self.config = config
         self.reward_terms = reward_terms(config.reward.terms)
-        self.observation_terms = observation_terms(config.observation.terms)
+        self.observation_terms = observation_terms(config.observed_terms)
         expert = self._set_arms()
         self.held_out: Demonstrations | None = None
         if demonstrations is None:
@@ -101,8 +101,6 @@ class ImitationEnv(Env):
         self.metric = config.metric.build(self.expert, self.learner)
         self.arm = arms.learner
         self.torque_scale = jnp.asarray(torque_scale(self.arm, config.action_scale, config.control_dt))
-        home = np.asarray(self.learner.home)
-        self._home_states = link_state_table(self.learner, home, np.zeros_like(home))
         self._set_physics(choose_physics(config.physics, self.arm.model))
         return arms.expert
 
@@ -153,10 +151,8 @@ class ImitationEnv(Env):
         self.start_poses = self._start_poses_of(demonstrations)
 
     def _start_poses_of(self, demonstrations: Demonstrations) -> Float[np.ndarray, "demonstrations joints"]:
-        if self.config.start == "home" or not demonstrations.count:
-            return home_poses(self.learner, demonstrations.count)
         capsules = self.capsules if "self_collision" in self.config.reward.terms else None
-        return nearest_poses(self.expert, self.learner, demonstrations.qpos[:, 0], self.metric.arguments, capsules)
+        return start_poses(self.expert, self.learner, demonstrations.qpos[:, 0], self.metric.arguments, capsules)
 
     @functools.cached_property
     def capsules(self) -> Capsules:
@@ -169,7 +165,7 @@ class ImitationEnv(Env):
         return changing_pairs(self.learner, self.capsules)
 
     def reset(self, rng: Array) -> State:
-        """Starts an episode: a random demonstration at its first step, the learner as the config's `start` says."""
+        """Starts an episode: a random demonstration at its first step, the learner at rest in its start pose."""
         return self.begin(self.start(rng))
 
     def begin(self, arm_state: ArmState) -> State:
@@ -177,7 +173,7 @@ class ImitationEnv(Env):
         zero = jnp.zeros(())
         metrics = {"distance": zero, "limit_excess": zero, "torque_saturation": zero, "runaway": zero}
         metrics |= {term.metric: zero for term in self.reward_terms}
-        return State(arm_state, self.observe_start(arm_state), zero, zero, metrics, {})
+        return State(arm_state, self.observe(arm_state), zero, zero, metrics, {})
 
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> ArmState:
         """The first state of an episode; the demonstration is random where None."""
@@ -185,8 +181,7 @@ class ImitationEnv(Env):
         if demonstration is None:
             demonstration = jax.random.randint(key_demonstration, (), 0, self.demonstrations.count)
         demonstration = jnp.asarray(demonstration, jnp.int32)
-        poses = jnp.asarray(self.start_poses)
-        qpos = poses[0 if self.config.start == "home" else demonstration]
+        qpos = jnp.asarray(self.start_poses)[demonstration]
         zero = jnp.zeros((), jnp.int32)
         return ArmState(qpos, jnp.zeros_like(qpos), zero, demonstration, key_next, self._draw_load(key_load))
 
@@ -347,17 +342,11 @@ class ImitationEnv(Env):
     def observe(self, state: ArmState) -> Float[Array, " observation"]:
         """The observation: the learner's link states, then the expert's now and at each of the next `preview` steps.
 
-        Sines, cosines and velocities of the learner's joints follow, then the config's `observation.terms`.
+        Sines, cosines and velocities of the learner's joints follow, then the config's `observed_terms`.
 
         A subclass may override it: every observation of the environment is then the subclass's.
         """
         return self._link_observation(state, link_states(self.learner, state.qpos, state.qvel))
-
-    def observe_start(self, state: ArmState) -> Float[Array, " observation"]:
-        """The observation of a state of `start`; at rest in the home pose it costs less than `observe`."""
-        if self._has_own_observation or self.config.start != "home":
-            return self.observe(state)
-        return self._link_observation(state, self._home_states)
 
     @property
     def _has_own_observation(self) -> bool:

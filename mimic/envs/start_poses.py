@@ -1,4 +1,4 @@
-"""Where the learner starts its episodes, at rest: in its home pose, or in the pose nearest to the demonstration's."""
+"""Where the learner starts its episodes, at rest."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from mimic.base.compilation import on_host
 from mimic.retargeting.costs import Costs
 from mimic.retargeting.pose import imitate_pose
 
-START_POSES = ("home", "nearest")
+_AT_HOME = 1e-4  # rad
 # Weight of the distance from the home pose, so that redundant joints start alike where many poses are equally near. It
 # adds 0.1 % to the mean distance of a Panda from a captured arm.
 _HOME = 0.01
@@ -21,19 +21,14 @@ _STARTS = 48  # random initial guesses: with 12 the poses are 0.4 % farther, and
 _CHUNK = 256  # poses at a time: one function is compiled for any number of demonstrations
 
 
-def home_poses(learner: Embodiment, count: int) -> Float[np.ndarray, "demonstrations joints"]:
-    """The learner's home pose for each demonstration [rad]."""
-    return np.tile(np.asarray(learner.home, np.float32), (count, 1))
-
-
-def nearest_poses(
+def start_poses(
     expert: Embodiment,
     learner: Embodiment,
     qpos: Float[np.ndarray, "demonstrations expert_joints"],
     metric: dict[str, Any],
     capsules: Capsules | None = None,
 ) -> Float[np.ndarray, "demonstrations joints"]:
-    """The learner's poses nearest to poses of the expert [rad], see `imitate_pose`.
+    """The learner's home pose where the expert starts in its own, else the pose nearest to the expert's [rad].
 
     Args:
       expert: n joints.
@@ -42,6 +37,21 @@ def nearest_poses(
       metric: correspondence, weights, rotation and reduction of the embodiment distance.
       capsules: of the learner, to start without self-collision; None to ignore it.
     """
+    poses = np.tile(np.asarray(learner.home, np.float32), (len(qpos), 1))
+    elsewhere = ~np.isclose(qpos, np.asarray(expert.home), rtol=0, atol=_AT_HOME).all(axis=1)
+    if elsewhere.any():
+        poses[elsewhere] = _nearest_poses(expert, learner, qpos[elsewhere], metric, capsules)
+    return poses
+
+
+def _nearest_poses(
+    expert: Embodiment,
+    learner: Embodiment,
+    qpos: Float[np.ndarray, "poses expert_joints"],
+    metric: dict[str, Any],
+    capsules: Capsules | None,
+) -> Float[np.ndarray, "poses joints"]:
+    """The poses nearest to the expert's, see `imitate_pose`."""
     count = len(qpos)
     padded = np.asarray(qpos, np.float32)[np.minimum(np.arange(-(-count // _CHUNK) * _CHUNK), count - 1)]
     chunks = padded.reshape(-1, _CHUNK, expert.num_joints)

@@ -246,8 +246,8 @@ def _check(config: EnvConfig) -> None:
             f"world.action_latency: expected a multiple of {PERIOD} s below control_dt = {config.control_dt} s, got "
             f"{latency}"
         )
-    if config.observation.terms:
-        raise ValueError(f"observation.terms: expected none with an inner loop, got {config.observation.terms}")
+    if config.observed_terms:
+        raise ValueError(f"observation.terms: expected none with an inner loop, got {config.observed_terms}")
     if config.randomization.torque_noise:
         raise ValueError("randomization.torque_noise: expected 0 with an inner loop; world.motor_gain is there")
 

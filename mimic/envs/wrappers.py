@@ -27,7 +27,7 @@ class FreshEpisodeWrapper(Wrapper):
         keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(arm.key, FIRST_STEP)
         steps = jax.vmap(lambda key: jax.random.randint(key, (), 0, self._imitation.config.horizon))(keys)
         arm = jax.vmap(self._imitation.at_step)(arm, steps)
-        return state.replace(pipeline_state=arm, obs=jax.vmap(self._imitation.observe_start)(arm))
+        return state.replace(pipeline_state=arm, obs=jax.vmap(self._imitation.observe)(arm))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Steps all environments of the batch, and restarts those whose episode is done."""

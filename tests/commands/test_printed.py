@@ -50,7 +50,7 @@ ENVIRONMENTS = {
     "changed world": mimic.env_config("panda4dof", world={"payload": [0.0, 1.0]}, control="joint_position"),
     "metric": mimic.env_config("planar4dof", metric="paper", limits="hardware", limit_weight=2.0),
     "sampled arms": mimic.env_config("any_arm", arms={"most_locked": 3, "unseen": ["1+2"]}),
-    "terms": mimic.env_config("panda4dof", reward={"terms": {"self_collision": 2.0}}, start="nearest"),
+    "terms": mimic.env_config("panda4dof", reward={"terms": {"self_collision": 2.0}}),
 }
 
 
@@ -68,7 +68,7 @@ def test_a_training_on_a_clip_keeps_the_learner(world):
     trained = training_env(env, mimic.ArmConfig(model="clip.xml"), demonstrations)
     config = compose("train", *shlex.split(train_command(trained))[3:]).env
     assert config == trained and config.learner == env.learner and config.demonstrations == demonstrations
-    assert config.world == env.world and (config.start == "nearest") == (world == "paper")
+    assert config.world == env.world and bool(config.reward.terms) == (world == "hardware")
 
 
 def test_a_printed_resume_continues_its_run(tmp_path, capsys):

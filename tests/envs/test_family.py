@@ -54,7 +54,6 @@ def test_arms_are_named_by_their_files(tmp_path):
     ("changes", "message"),
     [
         ({"physics": "mjx"}, "physics: expected auto or fused where the learner is drawn for each episode, got mjx"),
-        ({"start": "nearest"}, "start: expected home where .*, got nearest"),
         ({"preview": 2}, "preview: expected 1 where .*, got 2"),
         ({"randomization": {"mass": [0.5, 2]}}, r"randomization: expected the default where .*, got mass=\[0.5, 2.0\]"),
         (

@@ -49,7 +49,7 @@ def test_the_default_physics_is_resolved_and_can_be_replaced(planar_env):
 
 def test_reward_and_observation_follow_the_demonstration_step_by_step():
     """After i steps both use sample i of the demonstration. 1e-5: float32, of a table made in double precision."""
-    env = mimic.make("planar4dof", **SHORT_ARMS, preview=2, horizon=6, demonstrations=FEW)
+    env = mimic.make("planar4dof", **SHORT_ARMS, preview=2, horizon=6, demonstrations=FEW, observation={"terms": []})
     motions, which = env.demonstrations, 3
     expert_states, learner_states = (
         jax.jit(functools.partial(mimic.link_states, arm)) for arm in (env.expert, env.learner)

@@ -7,7 +7,7 @@ import pytest
 
 import mimic
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
-from mimic.envs.start_poses import CLEARANCE, nearest_poses
+from mimic.envs.start_poses import CLEARANCE, start_poses
 from mimic.envs.wrappers import fresh_episodes
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.rollout_frames import RolloutFrames
@@ -27,7 +27,7 @@ def moved(demonstrations, seed):
 
 @pytest.fixture(scope="module")
 def evaluator():
-    config = mimic.env_config("planar4dof", **SHORT_ARMS, start="nearest", **SETTINGS)
+    config = mimic.env_config("planar4dof", **SHORT_ARMS, **SETTINGS)
     training, held_out = training_and_held_out(config)
     return Evaluator(ImitationEnv(config, moved(training, 0)), moved(held_out, 1))
 
@@ -77,12 +77,13 @@ def test_episodes_that_restart_do_so_where_their_demonstration_starts(evaluator)
         np.testing.assert_allclose(states.obs, jax.jit(jax.vmap(env.observe))(arm), atol=1e-6)
 
 
-def test_home_is_the_default_and_other_names_are_rejected():
+def test_the_learner_starts_at_home_where_the_expert_does():
     env = mimic.make("planar4dof", **SHORT_ARMS, **SETTINGS)
-    assert env.config.start == "home"
     np.testing.assert_array_equal(env.start_poses, np.tile(np.float32(env.learner.home), (3, 1)))
-    with pytest.raises(ValueError, match="start: expected one of home, nearest"):
-        mimic.env_config("planar4dof", start="first")
+    qpos = np.stack([env.expert.home, env.expert.home + 0.3])
+    poses = start_poses(env.expert, env.learner, qpos, env.metric.arguments)
+    np.testing.assert_array_equal(poses[0], np.float32(env.learner.home))
+    assert np.abs(poses[1] - poses[0]).max() > 0.1
 
 
 @pytest.mark.slow
@@ -96,5 +97,5 @@ def test_an_arm_that_is_charged_for_self_collision_starts_without():
         axes = capsule_axes(env.learner, env.capsules, jnp.asarray(pose))
         return float(pair_distances(env.capsules, *axes)[env.changing_pairs].min())
 
-    assert max(map(smallest_distance, nearest_poses(*arguments))) < 0
-    assert min(map(smallest_distance, nearest_poses(*arguments, env.capsules))) > 0.8 * CLEARANCE
+    assert max(map(smallest_distance, start_poses(*arguments))) < 0
+    assert min(map(smallest_distance, start_poses(*arguments, env.capsules))) > 0.8 * CLEARANCE

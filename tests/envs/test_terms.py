@@ -45,7 +45,7 @@ def terms(own_registry):
 
 
 def test_terms_are_added(terms):
-    plain = mimic.make("planar4dof", physics="fused", **SMALL)
+    plain = mimic.make("planar4dof", physics="fused", observation={"terms": []}, **SMALL)
     env = make_env(mimic.env_config("planar4dof", physics="fused", **SMALL, **terms))
     action = jnp.array([0.5, -0.2, 0.1, 0.0])
     states = [one_step(plain, action), one_step(env, action)]
@@ -63,7 +63,7 @@ def test_terms_are_added(terms):
 
 @pytest.mark.slow
 def test_the_distance_gradient_is_that_of_finite_differences():
-    env = mimic.make("panda4dof", physics="fused", observation={"terms": ["distance_gradient"]}, **SMALL)
+    env = mimic.make("panda4dof", physics="fused", **SMALL)  # it is a term by default
     state = one_step(env, jnp.linspace(-0.5, 0.8, env.action_size)).pipeline_state
     observed = np.asarray(jax.jit(env.observe)(state)[-2 * env.action_size :])
     n, next_step = env.action_size, state.step + 1

@@ -238,8 +238,8 @@ def test_start_poses_are_within_the_ranges_of_the_inner_loop(nominal):
     lower = nominal.plant.constants.parameters.lower[:joints]
     beyond = np.full((nominal.demonstrations.count, joints), -3.0, np.float32)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(imitation, "nearest_poses", lambda *args: beyond)
-        env = make(start="nearest")
+        patch.setattr(imitation, "start_poses", lambda *args: beyond)
+        env = make()
     np.testing.assert_allclose(env.start_poses, np.tile(np.maximum(lower, -3.0), (len(beyond), 1)), atol=1e-6)
     assert (env.start_poses > -3.0).any()
 

@@ -292,16 +292,16 @@ def test_concurrent_kernels_learn_the_same_as_sequential_ones(physics, monkeypat
     assert jax.tree.all(jax.tree.map(np.array_equal, *learned))
 
 
-@pytest.mark.parametrize(("start", "are_displaced"), [("nearest", True), ("home", False)])
-def test_crossovers_start_anywhere_where_the_learner_starts_in_the_nearest_pose(start, are_displaced):
-    env = mimic.make("planar4dof", start=start, demonstrations={"count": 3, "held_out": 1})
+@pytest.mark.parametrize(("world", "are_displaced"), [("paper", True), ("ideal", False)])
+def test_crossovers_start_anywhere_unless_there_is_an_inner_loop(world, are_displaced):
+    env = mimic.make("planar4dof", world=world, demonstrations={"count": 3, "held_out": 1})
     first = with_crossovers(env, 20, seed=0).qpos[3:, 0]
     assert np.any(first != env.expert.home) == are_displaced
     assert np.all(first >= env.expert.joint_range[:, 0]) and np.all(first <= env.expert.joint_range[:, 1])
 
 
 def test_crossovers_of_motions_that_start_apart_start_where_these_do():
-    env = mimic.make("planar4dof", start="nearest", demonstrations={"count": 3, "held_out": 1})
+    env = mimic.make("planar4dof", demonstrations={"count": 3, "held_out": 1})
     apart = env.demonstrations.qpos + np.linspace(0, 0.3, 3)[:, None, None]
     env = env.with_demonstrations(dataclasses.replace(env.demonstrations, qpos=apart))
     mixed = with_crossovers(env, 20, seed=0).qpos[3:]

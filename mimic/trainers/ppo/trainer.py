@@ -299,11 +299,12 @@ def with_saved_demonstrations(config: EnvConfig, run_dir: Path | None) -> EnvCon
 def with_crossovers(env: ImitationEnv, count: int, seed: int) -> Demonstrations:
     """An environment's demonstrations with additional ones, see `crossovers`.
 
-    Where the learner starts in the nearest pose and all demonstrations in the same one, some of these start anywhere.
+    Where all demonstrations start in the same pose, some of these start anywhere, unless there is an inner loop.
     """
     recorded = env.demonstrations
     if count == 0 or recorded.count == 1:  # a single demonstration cannot be mixed
         return recorded
     start_alike = np.allclose(recorded.qpos[:, 0], recorded.qpos[0, 0])
-    joint_range = np.asarray(env.expert.joint_range) if env.config.start == "nearest" and start_alike else None
+    is_displaced = start_alike and env.config.kind == "one_arm"
+    joint_range = np.asarray(env.expert.joint_range) if is_displaced else None
     return concatenate(recorded, crossovers(recorded, count, seed, joint_range))
