@@ -191,7 +191,10 @@ def prepare_capture_inspection(source: Path, config: CaptureConfig) -> Callable[
     Raises:
       ValueError: what `read_motion` rejects.
     """
-    body = read_body(source, config)
+    try:
+        body = read_body(source, config)
+    except ValueError as error:
+        raise ValueError(str(error).replace("source:", "clip:", 1)) from error
 
     def run() -> None:
         console = Console()

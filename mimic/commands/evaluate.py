@@ -63,7 +63,7 @@ def _run_to_evaluate(config: EvaluateConfig) -> tuple[Path, TrainConfig]:
     if not config.run:
         raise ValueError("run: expected the run directory to evaluate, as in run=runs/NAME")
     run_dir = Path(config.run).expanduser()
-    trained = load_config(run_dir)  # saved with all values resolved, so that they do not depend on this machine
+    trained = load_config(run_dir, "run")  # saved with all values resolved, so that they do not depend on this machine
     check_checkpoint(run_dir, config.checkpoint)
     return run_dir, trained
 

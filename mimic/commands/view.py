@@ -32,7 +32,7 @@ from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.episodes import EXTRA
 from mimic.motions.mocap.live_hand import LiveHand
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.run_config import policy_run
+from mimic.trainers.run_config import check_run_dir, policy_run
 from mimic.viewer.hand_following import HandSettings
 from mimic.viewer.history import RATE
 from mimic.viewer.live_session import LiveSession
@@ -159,6 +159,7 @@ def _load_mapper(config: ViewConfig) -> "PoseMapper":
 
     run_dir = Path(config.mapper).expanduser()
     if config.mapper not in pretrained_names("pose_mapper") or run_dir.exists():
+        check_run_dir(run_dir, "mapper")
         return PoseMapper.load(run_dir, config.checkpoint)
     if config.checkpoint is not None:
         raise ValueError(f"checkpoint: expected none with mapper={config.mapper}, which comes with mimic")

@@ -118,18 +118,18 @@ class Demonstrations:
     def check_fits(self, arm: Embodiment, dt: float, horizon: int) -> None:
         """Raises a ValueError unless arm, time step and length fit those of an environment."""
         if (self.arm, self.joint_names) != (arm.name, arm.joint_names):  # joint1, joint2, … are names in many arms
+            expected, got = repr(arm.name), repr(self.arm)
+            if self.joint_names != arm.joint_names:
+                expected += f" with the joints {', '.join(arm.joint_names)}"
+                got += f" with {', '.join(self.joint_names)}"
             raise ValueError(
-                f"demonstrations: recorded with the joints {', '.join(self.joint_names)} of {self.arm!r}, "
-                f"but the expert {arm.name!r} has {', '.join(arm.joint_names)}"
+                f"demonstrations: expected motions of the expert {expected}, got those of {got}; env.expert=ARM sets "
+                "the expert of a new training"
             )
         if abs(self.dt - dt) > 1e-9:
-            raise ValueError(
-                f"demonstrations: recorded with a time step of {self.dt} s, but the environment has {dt} s"
-            )
+            raise ValueError(f"demonstrations: expected a time step of {dt} s (env.control_dt), got {self.dt} s")
         if self.horizon < horizon:
-            raise ValueError(
-                f"demonstrations: {self.horizon} steps long, but an episode of the environment has {horizon}"
-            )
+            raise ValueError(f"demonstrations: expected {horizon} steps or more (env.horizon), got {self.horizon}")
 
 
 def concatenate(first: Demonstrations, second: Demonstrations) -> Demonstrations:

@@ -267,7 +267,7 @@ def _read_params(path: Path, template: Any) -> Any:
     try:
         return read_parameters(file, template, max_bytes=_max_bytes(file))
     except OtherParameters as error:
-        raise ValueError(
+        raise OtherParameters(
             f"checkpoint {str(path)!r} does not fit the config of its run: it has other arms or another network "
             f"({error})"
         ) from error

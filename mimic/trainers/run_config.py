@@ -4,19 +4,28 @@ import dataclasses
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
 from mimic.base import registry
-from mimic.base.config import check_new, check_writable, explain, merged, schema, to_dict, typed
+from mimic.base.config import check_new, check_writable, explain, flatten, merged, schema, to_dict, typed
 from mimic.base.config_files import check_references, read_config
 from mimic.base.files import write_atomically
 from mimic.base.overrides import setting, shell_words
-from mimic.runs.checkpoints import check_checkpoint
+from mimic.envs.config import ObservationConfig
+from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import CONFIG, DEMONSTRATIONS
 from mimic.runs.lock import LOCK
+from mimic.runs.parameters import OtherParameters
 from mimic.trainers.config import PPOConfig, TrainConfig, trainer_config
 from mimic.trainers.run_models import MODELS, with_original_models, with_saved_models
+
+_OF_NETWORKS = (  # keys on which the sizes of a run's networks depend
+    *("env.expert.", "env.learner.", "env.arms", "env.world", "env.randomization.", "env.control", "env.preview"),
+    *("env.observation.", "env.environment", "env.metric.links", "env.metric.hand_"),
+    *("trainer.name", "trainer.network", "trainer.hidden_layers", "trainer.privileged_critic"),
+)
 
 
 def new_run_dir(config: TrainConfig) -> Path:
@@ -69,11 +78,18 @@ def run_schema(trainer: str) -> DictConfig:
     return merged(schema(TrainConfig), {"trainer": schema(trainer_config(trainer))})
 
 
-def load_config(run_dir: Path, *, saved_models: bool = True) -> TrainConfig:
+def check_run_dir(run_dir: Path, key: str) -> None:
+    """Raises a ValueError that names the key unless a path is that of a run directory."""
+    if not (run_dir / CONFIG).is_file():
+        raise ValueError(f"{key}: expected a run directory, which has a {CONFIG}, got {str(run_dir)!r}")
+
+
+def load_config(run_dir: Path, key: str = "run_dir", *, saved_models: bool = True) -> TrainConfig:
     """The config of a run.
 
     Args:
       run_dir: the run directory.
+      key: what the user set to it, for the line of an error.
       saved_models: whether its arms are those kept in the run directory, see `save_models`, instead of the files that
         the run started from.
 
@@ -81,13 +97,12 @@ def load_config(run_dir: Path, *, saved_models: bool = True) -> TrainConfig:
       ValueError: no run directory, a config that cannot be read, a plugin that is not loaded, or model files that were
         changed.
     """
+    check_run_dir(run_dir, key)
     config = _read_config(run_dir)
     return dataclasses.replace(config, env=with_saved_models(run_dir, config.env)) if saved_models else config
 
 
 def _read_config(run_dir: Path) -> TrainConfig:
-    if not (run_dir / CONFIG).is_file():
-        raise ValueError(f"{str(run_dir)!r} is not a run directory: it has no {CONFIG}")
     try:
         content = read_config(run_dir / CONFIG)
         check_references(content)  # before anything resolves them
@@ -110,8 +125,39 @@ def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:
     if not run:
         raise ValueError("run: expected the run directory to show, as in run=runs/NAME")
     run_dir = Path(run).expanduser()
-    trained = load_config(run_dir)
+    trained = load_config(run_dir, "run")
     if trained.trainer.name != "ppo":
         raise ValueError(f"run: expected a run of trainer=ppo, got one of {trained.trainer.name}")
     check_checkpoint(run_dir, checkpoint)
     return run_dir, trained
+
+
+def initial_params(config: TrainConfig, template: Any) -> Any:
+    """The parameters that a new run starts from: those of the last checkpoint of `init`.
+
+    Args:
+      config: resolved config of the new run.
+      template: see `load_checkpoint`.
+
+    Raises:
+      ValueError: `init` is no run directory, or a run whose networks have other inputs, outputs or layers.
+    """
+    run_dir = Path(config.init).expanduser()
+    given = load_config(run_dir, "init")
+    try:
+        return load_checkpoint(run_dir, template)[1]
+    except OtherParameters as error:
+        new, old = _of_networks(config), _of_networks(given)
+        keys = [key for key in new | old if new.get(key) != old.get(key)]
+        if not keys:
+            raise
+        keys = ["trainer.name"] if "trainer.name" in keys else keys
+        expected, got = (", ".join(setting(key, values.get(key)) for key in keys) for values in (new, old))
+        raise ValueError(f"init: expected a run of {expected}, got one of {got}") from error
+
+
+def _of_networks(config: TrainConfig) -> dict[str, Any]:
+    """The settings on which the sizes of a run's networks depend, by their keys."""
+    env = dataclasses.replace(config.env, observation=ObservationConfig(config.env.observed_terms))
+    values = flatten({"env": to_dict(env), "trainer": to_dict(config.trainer)})
+    return {key: value for key, value in values.items() if key.startswith(_OF_NETWORKS)}

@@ -19,7 +19,6 @@ from mimic.runs.checkpoints import (
     checkpoint_steps,
     delete_checkpoint,
     delete_partial_checkpoints,
-    load_checkpoint,
     load_training,
     mark_damaged_after,
 )
@@ -40,6 +39,7 @@ from mimic.trainers.report import make_report, show_report
 from mimic.trainers.run_config import (
     check_new_run,
     how_to_continue,
+    initial_params,
     is_brax,
     load_config,
     new_run_dir,
@@ -113,7 +113,7 @@ def prepare_training(
 
 def _resumed_config(run_dir: Path, requested: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
     """The config of a run directory, with the overrides of the command line that a resumed run accepts."""
-    config = load_config(run_dir)
+    config = load_config(run_dir, "resume")
     process_keys = ("resume=", "compilation_cache=", "distributed.", "logger=")  # taken from `requested`
     own = f"trainer={config.trainer.name}"  # chooses the keys that the command line accepts
     changes = [override for override in overrides if override != own and not override.startswith(process_keys)]
@@ -144,8 +144,8 @@ def _start(config: TrainConfig, resumed_dir: Path | None, trainer: Trainer, is_c
     if not resumed_dir or not checkpoint_steps(resumed_dir):  # new, or ended before its first checkpoint
         if not config.init:
             return None
-        _, params = load_checkpoint(Path(config.init).expanduser(), trainer.params_template())
-        return Checkpoint(0, params, None, {})
+        resolved = dataclasses.replace(config, env=trainer.env_config, trainer=trainer.settings)
+        return Checkpoint(0, initial_params(resolved, trainer.params_template()), None, {})
     restored = load_training(resumed_dir, trainer.params_template())
     if jax.default_backend() == "gpu" and not config.compilation_cache:
         print(

@@ -152,6 +152,10 @@ def test_bad_input_is_one_line(reason, clip, arguments, message):
     assert message in reason("demonstrations", f"source={clip}", "out=a.npz", *arguments)
 
 
+def test_the_line_of_an_inspection_names_its_key(reason):
+    assert reason("inspect", "clip=no.bvh").startswith("clip: no file at 'no.bvh'")
+
+
 def test_the_model_of_the_arm_is_not_overwritten(reason, clip, tmp_path):
     (tmp_path / "a.xml").write_text("mine")
     assert "a.xml' exists" in reason("demonstrations", f"source={clip}", f"out={tmp_path}/a.npz")

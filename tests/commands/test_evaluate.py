@@ -24,7 +24,7 @@ from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer
 from mimic.trainers.ppo import ppo
 from mimic.trainers.ppo.trainer import PPOTrainer
-from mimic.trainers.run_config import save_config
+from mimic.trainers.run_config import initial_params, save_config
 from tests.helpers.untrained_run import COUNT, HELD_OUT, HORIZON, environment, untrained_run
 
 
@@ -152,7 +152,7 @@ def test_bad_evaluations(reason, run_dir, arguments, message):
 def test_unfit_demonstrations(reason, run_dir, unseen, tmp_path):
     dataclasses.replace(unseen, arm="panda").save(tmp_path / "unfit.npz")
     arguments = [f"run={run_dir}", f"demonstrations={tmp_path}/unfit.npz", "compilation_cache="]
-    assert "recorded with the joints joint1, joint2, joint3 of" in reason("evaluate", *arguments)
+    assert "', got those of 'panda'; env.expert=ARM sets the expert" in reason("evaluate", *arguments)
 
 
 def test_a_checkpoint_of_another_environment(reason, run_dir, tmp_path):
@@ -160,8 +160,20 @@ def test_a_checkpoint_of_another_environment(reason, run_dir, tmp_path):
     shutil.rmtree(other / "checkpoints")
     shutil.copytree(run_dir / "checkpoints", other / "checkpoints")
     error = reason("evaluate", f"run={other}", "compilation_cache=")
-    # The other learner has a link more, of 12 numbers, and a joint more, of 3.
-    assert "does not fit the config of its run" in error and "expected shape (135,), got shape (120,)" in error
+    # The other learner has a link more, of 12 numbers, and a joint more, of 5.
+    assert "does not fit the config of its run" in error and "expected shape (141,), got shape (124,)" in error
+
+
+def test_a_run_does_not_start_from_networks_of_other_settings(reason, run_dir, tmp_path):
+    fixed = f"init={run_dir}", "env=planar4dof", "env.horizon=20", "trainer.hidden_layers=[8]", "compilation_cache="
+    changes = "env.observation.terms=[]", "env.expert.link_lengths=[0.5,0.4]", "env.learner.link_lengths=[0.5,0.5]"
+    demonstrations = "env.demonstrations.count=4", "env.demonstrations.held_out=2"
+    line = reason("train", *fixed, *changes, *demonstrations)
+    expected, got = line.removeprefix("init: expected a run of ").split(", got one of ")
+    assert "env.observation.terms=[]" in expected and "env.observation.terms=[distance_gradient]" in got
+    assert "env.expert.link_lengths=[0.5,0.4]" in expected and "learner" not in line and "hidden" not in line
+    with pytest.raises(ValueError, match="^init: expected a run directory, which has a config.yaml, got 'no'$"):
+        initial_params(TrainConfig(init="no"), None)
 
 
 def test_a_run_of_braxs_loop_is_not_resumed(reason, tmp_path):

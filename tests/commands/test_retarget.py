@@ -61,7 +61,7 @@ def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows():
         (["source=none.csv", "out=new", "costs.velocity=1"], "costs: expected no velocity or acceleration"),
         (["source=none.csv", "out=new", "hand=scaled", "base=auto"], "base: expected no auto with hand=scaled"),
         (["source={recorded}", "env=planar4dof"], "out: expected a folder"),
-        (["source={recorded}", "learner=panda4dof", "out=new"], "recorded with the joints"),
+        (["source={recorded}", "learner=panda4dof", "out=new"], "got those of"),
         (["source={recorded}", "learner=pair", "out=new"], "learner: expected an arm, or an environment"),
         (["source={recorded}", "env=planar4dof", "out={recorded}"], "exists; name a new folder"),
     ],

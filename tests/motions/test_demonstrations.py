@@ -102,10 +102,21 @@ def test_files_of_others_are_to_be_imported_first(tmp_path, name):
 @pytest.mark.parametrize(
     ("expert", "dt", "horizon", "message"),
     [
-        (mimic.planar_arm([0.5, 0.5]), 0.1, 50, "recorded with the joints joint1, .*, joint7 of 'panda', but the"),
-        (mimic.panda(locked=[7]), 0.1, 50, "recorded with the joints .* of 'panda', but the expert 'panda-joint7' has"),
-        (mimic.panda(), 0.05, 50, "recorded with a time step of 0.1 s, but the environment has 0.05 s"),
-        (mimic.panda(), 0.1, 51, "50 steps long, but an episode of the environment has 51"),
+        (
+            mimic.planar_arm([0.5, 0.5]),
+            0.1,
+            50,
+            "expected .* with the joints joint1, joint2, got .* with joint1, ",
+        ),
+        (mimic.panda(locked=[7]), 0.1, 50, "expected .* 'panda-joint7' with .*, joint6, got those of 'panda' with"),
+        (
+            dataclasses.replace(mimic.panda(), name="other"),
+            0.1,
+            50,
+            "expected motions of the expert 'other', got those of 'panda'; env.expert=ARM sets the expert",
+        ),
+        (mimic.panda(), 0.05, 50, r"expected a time step of 0.05 s \(env.control_dt\), got 0.1 s"),
+        (mimic.panda(), 0.1, 51, r"expected 51 steps or more \(env.horizon\), got 50"),
     ],
 )
 def test_demonstrations_of_another_arm_time_step_or_length_are_rejected(recorded, expert, dt, horizon, message):
@@ -130,7 +141,7 @@ def test_torques_and_velocities_beyond_the_limits_are_rejected_and_rounding_pass
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda recorded: dataclasses.replace(recorded, arm="other"), "recorded with the joints"),
+        (lambda recorded: dataclasses.replace(recorded, arm="other"), "got those of 'other'"),
         (lambda recorded: changed(recorded, "qvel", 3.0), "has a velocity of"),
         (lambda recorded: recorded.select([0]), r"has 1, expected at least count \+ held_out = 1 \+ 1"),
     ],

@@ -19,7 +19,7 @@ LOCKED = np.array([0, 0, 1, 0, 0, 0, 0, 1], bool)
 @pytest.fixture(scope="module")
 def policy():
     """The distribution's parameters as a function of an observation; for untrained and for random parameters."""
-    networks = make_networks(PPOConfig(hidden_layers=[8], network="joints").resolve(), SIZE, ACTIONS)
+    networks = make_networks(PPOConfig(hidden_layers=[8], network="joints").resolve(), SIZE, ACTIONS, 1)
     statistics = running_statistics.init_state(specs.Array((SIZE,), jnp.dtype("float32")))
     params = jax.jit(networks.policy_network.init)(jax.random.PRNGKey(0))
     leaves, structure = jax.tree.flatten(params)

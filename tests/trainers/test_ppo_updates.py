@@ -137,7 +137,7 @@ def _made_of(variables, program):
 @pytest.mark.parametrize("privileged", [False, True])
 def test_padded_inputs_change_no_output(privileged, monkeypatch):
     config = PPOConfig(hidden_layers=[16], privileged_critic=privileged, network="mlp")
-    networks = ppo.make_networks(config, OBSERVED, ACTIONS)
+    networks = ppo.make_networks(config, OBSERVED, ACTIONS, privileged_size=1)
     statistics, policy, value = ppo.initial_params(networks, OBSERVED, jax.random.PRNGKey(0))
     observation = jax.random.normal(jax.random.PRNGKey(1), (4, OBSERVED + privileged))
 

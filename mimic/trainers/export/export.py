@@ -104,7 +104,7 @@ def _check_packages(format: str) -> None:
 
 def _exportable(config: ExportConfig) -> TrainConfig:
     """The config of the run. Raises a `ValueError` for a policy with an inner loop, or of many arms."""
-    trained = load_config(_run_dir(config))
+    trained = load_config(_run_dir(config), "run")
     if trained.trainer.name == "ppo" and trained.env.kind == "inner_loop":
         raise ValueError(f"format: expected {CONTROLLER} for a run with an inner loop, got {config.format}")
     if trained.trainer.name == "ppo" and trained.env.kind == "sampled_arms":

@@ -41,7 +41,7 @@ def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable
     Raises:
       ValueError: a run of another kind, one that the safety layer cannot run, or a checkpoint that does not exist.
     """
-    trained = load_config(run_dir)
+    trained = load_config(run_dir, "run")
     config = trained.trainer
     if not isinstance(config, PPOConfig) or trained.env.kind != "inner_loop":
         raise ValueError(

@@ -72,7 +72,9 @@ def train(
             wrap_env_fn=wrap_for_training,
             episode_length=env.config.horizon + 1,
             normalize_observations=True,
-            network_factory=lambda *_, **__: make_networks(config, env.observation_size, env.action_size),
+            network_factory=lambda *_, **__: make_networks(
+                config, env.observation_size, env.action_size, env.privileged_size
+            ),
             num_evals=config.evaluations + 1,
             run_evals=False,
             num_eval_envs=1,

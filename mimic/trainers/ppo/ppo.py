@@ -63,7 +63,7 @@ _REPLICATED, _SHARDED = PartitionSpec(), PartitionSpec(_AXIS)
 
 
 def make_networks(
-    config: PPOConfig, observation_size: int, action_size: int, privileged_size: int = 1
+    config: PPOConfig, observation_size: int, action_size: int, privileged_size: int
 ) -> ppo_networks.PPONetworks:
     """The policy and value network of the trainer's settings.
 
@@ -148,7 +148,8 @@ def params_template(config: PPOConfig, observation_size: int, action_size: int, 
 
 def make_controller(config: PPOConfig, observation_size: int, action_size: int) -> Callable[[Params], Controller]:
     """The deterministic policy as a function of its parameters."""
-    make_policy = ppo_networks.make_inference_fn(make_networks(config, observation_size, action_size))
+    networks = make_networks(config, observation_size, action_size, privileged_size=0)  # the policy has no such input
+    make_policy = ppo_networks.make_inference_fn(networks)
 
     def controller(params: Params) -> Controller:
         policy, unused_key = make_policy(params, deterministic=True), jax.random.PRNGKey(0)
