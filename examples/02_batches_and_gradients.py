@@ -27,7 +27,7 @@ distance = mimic.motion_distance(expert, learner, correspondence, mimic.PAPER_WE
 
 
 def composed(expert_qpos, expert_qvel, learner_qpos, learner_qvel):
-    """The same, composed: any weights, correspondence or reduction can be used here."""
+    """The same, composed: any weights or correspondence can be used here."""
     return mimic.embodiment_distance(
         mimic.link_states(expert, expert_qpos, expert_qvel),
         mimic.link_states(learner, learner_qpos, learner_qvel),

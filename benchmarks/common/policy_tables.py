@@ -25,8 +25,7 @@ SPLITS = {"train": "training", "held_out": "held out"}
 def pose_methods(pose: Results) -> list[Cells]:
     names = {
         "newton": "`imitate_pose`",
-        "gradient_descent": "gradient descent, 13 initial guesses",
-        "gradient_descent, one start": "gradient descent, one initial guess (paper)",
+        "paper": "gradient descent, one initial guess (paper)",
         "mink": "mink, on the CPU",
     }
     rows: list[Cells] = [("pair", "method", "above the best known", "global minimum", "poses/s")]

@@ -64,8 +64,8 @@ _FINISHING = 5  # Newton steps of each stage without the metric
 _STAGES = (1.0, 1e-4, 0.0), (1e-3, 1e-2, 0.03), (1e-3, 1e-2, 0.0), (1e-3, 1e-3, 0.0), (0.0, 1e-4, 0.0)
 _WARM_STEPS = 10  # Newton steps from a warm start
 _APART = 0.1  # rad, between the poses of different branches
-DESCENTS, SET = Descents("newton", 18, 12), 64  # of each pose of a motion; random poses of which one is a guess
-_OF_NEAREST = Descents("newton", 24, 30)
+DESCENTS, SET = Descents(18, 12), 64  # of each pose of a motion; random poses of which one is a guess
+_OF_NEAREST = Descents(24, 30)
 _INEXACT, _POSITION_FIRST = 1e3, 1e4  # in the order of postures: of hands that are not exact, and per m of their error
 
 

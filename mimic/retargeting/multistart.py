@@ -8,7 +8,7 @@ the descents from all guesses run in parallel, in a loop of their own. Both give
 
 import functools
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,14 +22,12 @@ from mimic.retargeting.optimizers import (
     Limits,
     NewtonState,
     Solution,
-    gradient_descent,
     newton,
     newton_start,
     newton_step,
     solution_at,
 )
 
-Method = Literal["newton", "gradient_descent"]
 _ROUGH_FRACTION = 0.35  # of the iterations, for descents from all initial guesses; the best ones get the others
 
 # Derivatives at joint angles, with `smoothing`; see `PoseObjective.derivatives`.
@@ -39,7 +37,6 @@ SmoothedObjective = Callable[..., Derivatives]
 class Descents(NamedTuple):
     """Settings of the descents to a pose: see `imitate_pose`."""
 
-    method: Method
     iterations: int
     kept: int | None
 
@@ -61,16 +58,11 @@ def best_descent(
       descents: settings. The `kept` best descents continue after the rough iterations. None continues all, with the
         exact objective only.
     """
-    exact, rough = (functools.partial(objective, smoothing=smoothing) for smoothing in (SMOOTHING, ROUGH_SMOOTHING))
-    descend = newton if descents.method == "newton" else gradient_descent
     if descents.kept is None:
-        ends = descend(exact, guesses.swapaxes(0, 1), limits, descents.iterations)
-    elif descents.method == "newton":
-        ends = kept_descents(objective, guesses, limits, descents)
+        exact = functools.partial(objective, smoothing=SMOOTHING)
+        ends = newton(exact, guesses.swapaxes(0, 1), limits, descents.iterations)
     else:
-        ends = descend(rough, guesses.swapaxes(0, 1), limits, descents.rough_iterations)
-        best = _best_lanes(ends, min(descents.kept, len(guesses)))
-        ends = descend(exact, best.qpos, limits, descents.iterations - descents.rough_iterations)
+        ends = kept_descents(objective, guesses, limits, descents)
     return jax.tree.map(lambda x: x[..., 0, :], _best_lanes(ends, 1))
 
 
@@ -82,7 +74,7 @@ def kept_descents(
     settings: tuple[Any, Any] = (ROUGH_SMOOTHING, SMOOTHING),
     apart: float = 0.0,
 ) -> Solution:
-    """The ends [kept, poses] of the descents that are kept, by Newton's method.
+    """The ends [kept, poses] of the descents that are kept.
 
     Args:
       objective: of joint angles [lanes, poses] each.

@@ -1,6 +1,6 @@
-"""Minimisers of a smooth function of joint angles within limits, from one start or from a batch of them.
+"""Newton's method for a smooth function of joint angles within limits, from one start or from a batch of them.
 
-They compute on scalar components (see `mimic.base.spatial`), so that a batch of descents is elementwise: its lanes
+It computes on scalar components (see `mimic.base.spatial`), so that a batch of descents is elementwise: its lanes
 are the last axes of the start, and the objective gets joint angles of the shape of the lanes.
 """
 
@@ -17,9 +17,6 @@ from mimic.base.spatial import Scalar, minus, plus, times
 
 _MAX_STEP = 1.0  # rad, of a joint in one Newton step
 _FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 8.0  # of the Hessian: initial value, factors after a success and a failure
-# rad per unit of gradient, in gradient descent: stable for the static rotational measure (2 over its maximum curvature
-# is 0.46 for planar arms of 4 and 7 links, 0.64 for two Pandas).
-_GRADIENT_STEP = 0.4
 
 Scalars = Sequence[Scalar]
 Limits = tuple[Any, Any]  # lower, upper [rad]; constant infinite limits cost nothing
@@ -114,20 +111,6 @@ def newton_step(objective: Objective, state: NewtonState, limits: Limits) -> New
     return stored(NewtonState(best_qpos, best, damping * jnp.where(better, _LESS, _MORE)))
 
 
-def gradient_descent(
-    objective: Objective, start: Float[Array, "joints *lanes"], limits: Limits, iterations: int
-) -> Solution:
-    """Gradient descent with a constant step size (paper)."""
-    bounds = _bounds(limits, start.shape[0])
-
-    def iterate(qpos: Any, _: None) -> tuple[Any, None]:
-        gradient = objective(qpos).gradient  # the other derivatives are unused and eliminated
-        return _within([q - _GRADIENT_STEP * g for q, g in zip(qpos, gradient, strict=True)], bounds), None
-
-    qpos, _ = jax.lax.scan(iterate, _within(list(start), bounds), None, length=iterations)
-    return _solution(qpos, objective(qpos), bounds)
-
-
 def _descent_step(here: Derivatives, free: Scalars, damping: Scalar) -> Scalars:
     """-(L |D| L^T)^-1 g for the damped Hessian L D L^T of the free joints: downhill, whatever the curvature."""
     joints, eps = len(here.gradient), jnp.finfo(jnp.result_type(here.value)).eps
@@ -195,10 +178,7 @@ def _max_abs(values: Scalars) -> Scalar:
 
 def solution_at(state: NewtonState, limits: Limits) -> Solution:
     """The result of a descent that ends in this state."""
-    return _solution(state.qpos, state.here, _bounds(limits, len(state.qpos)))
-
-
-def _solution(qpos: Scalars, here: Derivatives, bounds: Sequence[tuple[Scalar, Scalar] | None]) -> Solution:
-    free = _free(qpos, here.gradient, bounds)
-    gradient_norm = _max_abs([times(f, g) for f, g in zip(free, here.gradient, strict=True)])
-    return Solution(jnp.stack(qpos), here.value, gradient_norm)
+    gradient = state.here.gradient
+    free = _free(state.qpos, gradient, _bounds(limits, len(state.qpos)))
+    gradient_norm = _max_abs([times(f, g) for f, g in zip(free, gradient, strict=True)])
+    return Solution(jnp.stack(state.qpos), state.here.value, gradient_norm)

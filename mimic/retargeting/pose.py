@@ -18,22 +18,21 @@ from mimic.arms.pose_limits import continuous_joints, pose_limits
 from mimic.base.compilation import compiled_once
 from mimic.base.config import check_choice
 from mimic.base.spatial import array_library
-from mimic.metric.distance import Correspondence, DistanceWeights, Metric, Reduction, RotationMeasure, Weights
+from mimic.metric.distance import Correspondence, DistanceWeights, Metric, RotationMeasure, Weights
 from mimic.metric.hand import NO_HAND, HandWeights
 from mimic.metric.kinematics import resting_link_states
 from mimic.retargeting.costs import NO_COSTS, Costs, with_costs
 from mimic.retargeting.exact_pose import SET, exact_poses, exact_solver
 from mimic.retargeting.hand_target import HandError, Placement, placement
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
-from mimic.retargeting.multistart import Descents, Method, best_descent
+from mimic.retargeting.multistart import Descents, best_descent
 from mimic.retargeting.pose_objective import PoseObjective, pose_objective
 
-METHODS = ("newton", "gradient_descent")
 Hand = Literal["free", "exact"]
 HANDS = ("free", "exact")
 AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
-ITERATIONS = {"newton": 16, "gradient_descent": 1000}
+ITERATIONS = 16
 STARTS = {"free": 12, "exact": 35}
 FLAT = 1e-3  # gradient [1/rad] of a converged pose, as a fraction of the mean distance of random poses
 
@@ -68,11 +67,9 @@ def imitate_pose(
     starts: int | None = None,
     key: Array | None = None,
     warm_start: Float[ArrayLike, "*batch learner_joints"] | None = None,
-    method: Method = "newton",
-    iterations: int | None = None,
+    iterations: int = ITERATIONS,
     kept: int | None = 2,
     rotation: RotationMeasure = "cosine",
-    reduction: Reduction = "mean",
     hand_weights: HandWeights = NO_HAND,
     costs: Costs | None = None,
     capsules: Capsules | None = None,
@@ -81,8 +78,8 @@ def imitate_pose(
 
     The distance has local minima, so each pose is optimised from several initial guesses: the expert's angles in the
     joints that both arms have by name, and the nearest pose of each of `starts` sets of random poses. The best result
-    is returned. "newton" is a damped Newton method on the exact second derivative with negative curvature flipped
-    (saddle-free Newton); "gradient_descent" is the paper's descent with a constant step.
+    is returned. The method is Newton's, damped, on the exact second derivative with negative curvature flipped
+    (saddle-free Newton).
 
     The first call compiles; later calls with equal arms, metric, options and shapes do not, see
     `mimic.base.compilation.by_value`. Functions in the metric are compared by identity: make a `lambda` once.
@@ -101,34 +98,30 @@ def imitate_pose(
       hand: "exact" puts the learner's hand where the expert's is, in metres, and takes of all postures with this hand
         within the joint ranges the one of minimum distance. Where none is found, as with fewer than six joints or out
         of reach, the hand's position is the nearest, and then its rotation: see `PoseImitation.hand`. Costs count among
-        postures with this hand; `method`, `iterations` and `kept` are of "free", which leaves the hand to the metric.
+        postures with this hand; `iterations` and `kept` are of "free", which leaves the hand to the metric.
       base: the learner's base in the expert's base frame, for exact hands: x, y, z, yaw in m and rad, or a pose [4, 4];
         None for the same base. Link directions are compared in the same axes, positions each from its own base.
       starts: number of random initial guesses, 12 where None, 35 for exact hands; with 0 the expert's angles are the
         only one.
       key: of the random poses; `jax.random.key(0)` where None.
       warm_start: [..., n_hat] replaces all initial guesses.
-      method: "newton" or "gradient_descent".
-      iterations: of each descent; where None, 16 for Newton's method and 1000 for gradient descent.
+      iterations: of each descent.
       kept: number of best descents that continue after a third of the iterations. None continues all, which doubles
         the computation; on a GPU it halves the compilation.
       rotation: see `embodiment_distance`.
-      reduction: see `embodiment_distance`.
       hand_weights: see `embodiment_distance`.
       costs: see `Costs`; None for the embodiment distance alone. The returned distance is without them.
       capsules: of the learner, from `fit_capsules`, for the costs of collisions.
 
     Raises:
-      ValueError: poses of the wrong shape or not finite, an unknown method, or a count below its minimum.
+      ValueError: poses of the wrong shape or not finite, or a count below its minimum.
     """
     poses = checked_poses(expert, _concrete(qpos))
-    check_choice("method", method, METHODS)
     # Longer than 40 lines: argument checks, and functions that share the arguments.
-    count = ITERATIONS[method] if iterations is None else iterations
     check_hand(hand, base, expert, learner)
     starts = STARTS[hand] if starts is None else starts
-    if starts < 0 or count < 2:
-        raise ValueError(f"starts, iterations: expected at least 0 and 2, got {starts} and {count}")
+    if starts < 0 or iterations < 2:
+        raise ValueError(f"starts, iterations: expected at least 0 and 2, got {starts} and {iterations}")
     if kept is not None and kept < 1:
         raise ValueError(f"kept: expected at least 1, or None for all, got {kept}")
     costs = NO_COSTS if costs is None else costs
@@ -138,8 +131,8 @@ def imitate_pose(
             "costs: expected velocity and acceleration of 0 for single poses; imitate_trajectory takes them"
         )
     warm = None if warm_start is None else checked_poses(learner, _concrete(warm_start), "warm_start")
-    metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
-    descents = Descents(method, count, kept)
+    metric = Metric(correspondence, weights, rotation, hand_weights)
+    descents = Descents(iterations, kept)
     dtype = jax.dtypes.canonicalize_dtype(poses.dtype)
     if hand == "exact":
         solve = _exact_solver(expert, learner, metric, bool(starts), costs, capsules if costs.of_capsules else None)
@@ -245,8 +238,8 @@ def _data_of(expert: Any, learner: Any, metric: Metric, costs: Costs, dtype: Any
         raise ValueError("expert, learner: expected two embodiments or two arms as data, got one of each")
     if not metric.is_weighted_sum or costs != NO_COSTS:
         raise ValueError(
-            "metric, costs: expected a constant correspondence and weights, the reduction mean and no costs for arms "
-            "as data; embodiments take all"
+            "metric, costs: expected a constant correspondence and weights, and no costs for arms as "
+            "data; embodiments take all"
         )
     shape = metric.correspondence.shape  # type: ignore[union-attr]
     if isinstance(metric.correspondence, Tracer):

@@ -27,7 +27,7 @@ def descend(guesses, *, kept, static=True):
     poses = jnp.asarray(np.random.default_rng(0).uniform(-3, 3, (3, 3)), guesses.dtype)
     targets = jax.vmap(objective.target, -1, -1)(resting_link_states(EXPERT, poses.T))
     limits = pose_limits(LEARNER, guesses.dtype)
-    return best_descent(objective.of_batch(targets), guesses, limits, Descents("newton", 3, kept))
+    return best_descent(objective.of_batch(targets), guesses, limits, Descents(3, kept))
 
 
 def guesses(count):

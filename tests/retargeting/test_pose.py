@@ -120,18 +120,6 @@ def test_distances_belong_to_the_poses_and_no_nearby_pose_is_better():
 
 
 @pytest.mark.slow
-def test_newton_beats_gradient_descent():
-    expert, learner = PAIRS["panda 7->4"]
-    qpos, correspondence = poses(expert, 32), overlap_correspondence(expert, learner)
-    newton, plain = (
-        imitate_pose(expert, learner, qpos, correspondence, DIRECTIONS, method=method)
-        for method in ("newton", "gradient_descent")
-    )
-    assert np.all(newton.distance <= plain.distance + 1e-5)
-    assert np.mean(plain.distance - newton.distance) < 1e-2  # the paper's way gets near
-
-
-@pytest.mark.slow
 def test_dropped_initial_guesses_are_not_missed():
     expert, learner = PAIRS["planar 3->2"]
     arguments = expert, learner, poses(expert, 64), overlap_correspondence(expert, learner), DIRECTIONS
@@ -185,7 +173,6 @@ def test_trajectories_do_not_jump(metric, limits):
         (np.zeros(6), {}, r"qpos: expected shape \[..., 7\] for planar7, got \(6,\)"),
         (np.full(7, np.nan), {}, "qpos: expected finite angles"),
         (np.zeros((0, 7)), {}, "qpos: expected one pose or more"),
-        (np.zeros(7), {"method": "magic"}, "method: expected one of newton, gradient_descent, got 'magic'"),
         (np.zeros(7), {"starts": -1}, "starts, iterations"),
         (np.zeros(7), {"hand": "near"}, "hand: expected one of free, exact, got 'near'"),
         (np.zeros(7), {"kept": 0}, "kept: expected at least 1, or None for all, got 0"),
