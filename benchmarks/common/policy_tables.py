@@ -65,18 +65,6 @@ def simulations(paper: Results, others: Results) -> list[Cells]:
     return rows
 
 
-def kinds_of_motions(training: Results) -> list[Cells]:
-    """Gaps of each kind of validation motions by environment, the range over seeds."""
-    names = {env: f"{pair.split()[-1]} joints" for env, pair in ENVIRONMENTS.items()}
-    rows: list[Cells] = [("validation motions, gap [%]", *names.values())]
-    kinds = [kind for kind in training["rows"][0]["by_kind"] if kind != "all"]
-    for kind in [*kinds, "all"]:
-        by_env = ([row["by_kind"][kind]["held_out"] for row in where(training["rows"], env=env)] for env in names)
-        label = kind if kind == "all" else f"`{kind}`"
-        rows.append((label, *(span([numbers["optimality_gap"] for numbers in runs]) for runs in by_env)))
-    return rows
-
-
 def unseen_motions(motions: Results) -> list[Cells]:
     """Gap of the policy and of controllers without learning on motions from the home pose, by environment."""
     controllers = {row["controller"] for row in motions["rows"]}
@@ -97,7 +85,7 @@ def unseen_motions(motions: Results) -> list[Cells]:
 
 def motions_from_anywhere(motions: Results) -> list[Cells]:
     """Mean distance above the bound, in thousandths, on kinds of motions that no training has, by environment."""
-    names = "policy", "copy_joints", "one_step", "nearest_pose", "computed_torque"
+    names = "policy", "nearest_pose", "computed_torque"
     rows: list[Cells] = [("joints", "motions", "holding still", "policy", *(f"`{name}`" for name in names[1:]))]
     new = where(motions["rows"], set="new")
     for env, kind in dict.fromkeys((row["env"], row["kind"]) for row in new):

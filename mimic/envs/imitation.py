@@ -301,9 +301,9 @@ class ImitationEnv(Env):
     def restart_done(self, states: State) -> State:
         """Starts a new episode, on a random demonstration, for each arm of a batch whose episode is done."""
         arms = arm_state(states)
-        new = jax.vmap(self.reset)(arms.key)
-        arms, obs = where_done(states.done, (new.pipeline_state, new.obs), (arms, states.obs))
-        return states.replace(pipeline_state=arms, obs=obs)
+        arms = where_done(states.done, jax.vmap(self.start)(arms.key), arms)
+        # Once for all arms: XLA removes the observations of `step`, which nothing uses.
+        return states.replace(pipeline_state=arms, obs=jax.vmap(self.observe)(arms))
 
     def distance(
         self, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"], demonstration: Array, step: Array

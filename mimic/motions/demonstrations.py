@@ -176,7 +176,11 @@ def check_effort(demonstrations: Demonstrations, arm: Embodiment, speed: float =
 
 
 def crossovers(
-    demonstrations: Demonstrations, count: int, seed: int, joint_range: Float[np.ndarray, "joints 2"] | None = None
+    demonstrations: Demonstrations,
+    count: int,
+    seed: int,
+    displaced: float = 0.0,
+    joint_range: Float[np.ndarray, "joints 2"] | None = None,
 ) -> Demonstrations:
     """Additional demonstrations, mixed from existing ones: each joint moves as in a random one of them.
 
@@ -190,8 +194,9 @@ def crossovers(
       demonstrations: the existing demonstrations.
       count: number of additional demonstrations.
       seed: random seed of the mixing.
-      joint_range: two of five are also displaced, each joint by a random constant that leaves it in its range [rad], so
-        that they start anywhere; None for motions from where the demonstrations start.
+      displaced: fraction that is also displaced, each joint by a random constant that leaves it in its range, so that
+        they start anywhere.
+      joint_range: minimum and maximum angle of each joint [rad]; needed where any is displaced.
     """
     joints, rng = np.arange(len(demonstrations.joint_names)), np.random.default_rng(seed)
     parents = rng.integers(demonstrations.count, size=(count, len(joints)))
@@ -201,9 +206,10 @@ def crossovers(
     less = np.where(np.arange(count)[:, None] % 4 == 3, 1 - rng.uniform(size=(count, 1)) * moves, 0.0)
     start = qpos[:, 0]
     qpos, goals = qpos - less[:, None] * (qpos - start[:, None]), goals - less * (goals - start)
-    if joint_range is not None:
+    if displaced:
+        assert joint_range is not None
         down, up = joint_range[:, 0] - qpos.min(axis=1), joint_range[:, 1] - qpos.max(axis=1)
-        offset = rng.uniform(np.minimum(down, 0), np.maximum(up, 0)) * (np.arange(count)[:, None] % 5 < 2)
+        offset = rng.uniform(np.minimum(down, 0), np.maximum(up, 0)) * (rng.uniform(size=(count, 1)) < displaced)
         qpos, goals = qpos + offset[:, None], goals + offset
     mixed: dict[str, Any] = {"qpos": qpos, "qvel": qvel - less[:, None] * qvel, "goals": goals}
     return dataclasses.replace(

@@ -102,6 +102,8 @@ class PPOConfig(TrainerConfig):
       hidden_layers: widths of the hidden layers of the policy and value networks; with network "joints" of the latter.
       crossovers: number of additional training demonstrations, mixed joint by joint from the recorded ones, see
         `crossovers` in mimic/motions/demonstrations.py.
+      displaced_crossovers: fraction of these that start anywhere in the joint ranges, where all demonstrations start in
+        the same pose.
       privileged_critic: whether the value network also observes what the policy never does: the elapsed fraction of the
         episode, the expert's future and, in a world with an inner loop, what was drawn for it, see
         `ImitationEnv.privileged`.
@@ -136,6 +138,7 @@ class PPOConfig(TrainerConfig):
     network: FromPreset[str] = _unset()
     hidden_layers: FromPreset[list[int]] = number(None, at_least=1, at_most=2**16, entries=(1, 32))
     crossovers: FromPreset[int] = number(None, at_least=0, at_most=100_000)
+    displaced_crossovers: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
     privileged_critic: bool = True
     target_gap: float = number(0.0, at_least=0.0, at_most=100.0)
     evaluations: FromPreset[int] = number(None, at_least=1, at_most=1_000_000)

@@ -21,6 +21,7 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
         "network": "mlp",
         "hidden_layers": [128, 128],
         "crossovers": 4000,
+        "displaced_crossovers": 0.2,
         "evaluations": 10,
     },
     # One GPU: enough environments to keep it busy. The high entropy cost makes the arm explore other pose branches.
@@ -39,6 +40,7 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
         "network": "mlp",
         "hidden_layers": [512, 256],
         "crossovers": 8000,
+        "displaced_crossovers": 0.4,
         "evaluations": 8,
     },
 }
@@ -51,9 +53,11 @@ _OF_SAMPLED_ARMS = {
     "discounting": 0.97,
     "entropy_cost": 0.0,
     "final_entropy_cost": 1.0,
+    "displaced_crossovers": 0.0,  # the learner starts at home
 }
-# With an inner loop: a smaller learning rate ends with a smaller gap (measured), and delays need a longer horizon.
-_OF_INNER_LOOP = {"learning_rate": 3e-4, "discounting": 0.9, "entropy_cost": 0.02}
+# With an inner loop episodes start in the ready pose. A smaller learning rate ends with a smaller gap (measured), and
+# delays need a longer horizon.
+_OF_INNER_LOOP = {"learning_rate": 3e-4, "discounting": 0.9, "entropy_cost": 0.02, "displaced_crossovers": 0.0}
 # The presets of each kind of environment, on the backends cpu and gpu.
 PPO_PRESETS_OF: dict[Kind, tuple[str, str]] = {
     "one_arm": ("cpu", "gpu"),

@@ -295,7 +295,8 @@ def test_concurrent_kernels_learn_the_same_as_sequential_ones(physics, monkeypat
 @pytest.mark.parametrize(("world", "are_displaced"), [("paper", True), ("ideal", False)])
 def test_crossovers_start_anywhere_unless_there_is_an_inner_loop(world, are_displaced):
     env = mimic.make("planar4dof", world=world, demonstrations={"count": 3, "held_out": 1})
-    first = with_crossovers(env, 20, seed=0).qpos[3:, 0]
+    settings = PPOConfig(crossovers=20).resolve("cpu", env=env.config)
+    first = with_crossovers(env, settings, seed=0).qpos[3:, 0]
     assert np.any(first != env.expert.home) == are_displaced
     assert np.all(first >= env.expert.joint_range[:, 0]) and np.all(first <= env.expert.joint_range[:, 1])
 
@@ -304,6 +305,7 @@ def test_crossovers_of_motions_that_start_apart_start_where_these_do():
     env = mimic.make("planar4dof", demonstrations={"count": 3, "held_out": 1})
     apart = env.demonstrations.qpos + np.linspace(0, 0.3, 3)[:, None, None]
     env = env.with_demonstrations(dataclasses.replace(env.demonstrations, qpos=apart))
-    mixed = with_crossovers(env, 20, seed=0).qpos[3:]
+    settings = PPOConfig(crossovers=20, displaced_crossovers=1.0).resolve("cpu")
+    mixed = with_crossovers(env, settings, seed=0).qpos[3:]
     whole = mixed[np.arange(20) % 4 < 3, 0]
     assert np.isclose(whole[:, None], apart[None, :, 0], atol=1e-9).any(axis=1).all()

@@ -64,7 +64,7 @@ class PPOTrainer(Trainer):
             unseen.check_fits(env.expert, config.env.control_dt, unseen.horizon)
             check_effort(unseen, env.expert)
             env, held_out = env.with_horizon(unseen.horizon), unseen
-        mixed = with_crossovers(env, self.settings.crossovers, config.env.demonstrations.seed)
+        mixed = with_crossovers(env, self.settings, config.env.demonstrations.seed)
         self._env = env if mixed is env.demonstrations else env.with_demonstrations(mixed)
         self._demonstrations = concatenate(env.demonstrations, held_out)
         self.env_config = dataclasses.replace(config.env, physics=env.physics.name)
@@ -296,15 +296,12 @@ def with_saved_demonstrations(config: EnvConfig, run_dir: Path | None) -> EnvCon
     return dataclasses.replace(config, demonstrations=saved)
 
 
-def with_crossovers(env: ImitationEnv, count: int, seed: int) -> Demonstrations:
-    """An environment's demonstrations with additional ones, see `crossovers`.
-
-    Where all demonstrations start in the same pose, some of these start anywhere, unless there is an inner loop.
-    """
+def with_crossovers(env: ImitationEnv, settings: PPOConfig, seed: int) -> Demonstrations:
+    """An environment's demonstrations with the additional ones of the settings, see `crossovers`."""
     recorded = env.demonstrations
-    if count == 0 or recorded.count == 1:  # a single demonstration cannot be mixed
+    if settings.crossovers == 0 or recorded.count == 1:  # a single demonstration cannot be mixed
         return recorded
     start_alike = np.allclose(recorded.qpos[:, 0], recorded.qpos[0, 0])
-    is_displaced = start_alike and env.config.kind == "one_arm"
-    joint_range = np.asarray(env.expert.joint_range) if is_displaced else None
-    return concatenate(recorded, crossovers(recorded, count, seed, joint_range))
+    displaced = settings.displaced_crossovers if start_alike else 0.0
+    mixed = crossovers(recorded, settings.crossovers, seed, displaced, np.asarray(env.expert.joint_range))
+    return concatenate(recorded, mixed)
