@@ -328,9 +328,9 @@ class ImitationEnv(Env):
         if isinstance(self.metric.weights, LinkDistance):
             with jax.ensure_compile_time_eval():
                 per_pair = float(self.metric.weights.function(*_opposite_links()))
-        # The entries of hard and soft W sum to n + n_hat.
+        # The Frobenius norm is at most the sum of the entries; those of hard and soft W sum to n + n_hat.
         total = n + n_hat if callable(self.metric.correspondence) else np.asarray(self.metric.correspondence).sum()
-        of_links = per_pair * total / (n * n_hat)
+        of_links = per_pair * total / (n * n_hat if metric.reduction == "mean" else 1)
         hand = self.metric.hand_weights
         return float(of_links + np.pi * hand.rotation + 2 * hand.position)
 

@@ -34,7 +34,7 @@ def start_poses(
       expert: n joints.
       learner: n_hat joints.
       qpos: first poses of the demonstrations [rad].
-      metric: correspondence, weights and rotation measure of the embodiment distance.
+      metric: correspondence, weights, rotation and reduction of the embodiment distance.
       capsules: of the learner, to start without self-collision; None to ignore it.
     """
     poses = np.tile(np.asarray(learner.home, np.float32), (len(qpos), 1))

@@ -22,12 +22,14 @@ from mimic.metric.correspondence import (
     soft_correspondence,
 )
 from mimic.metric.distance import (
+    REDUCTIONS,
     ROTATION_MEASURES,
     Correspondence,
     DistanceWeights,
     LinkDistance,
     Metric,
     PairDistances,
+    Reduction,
     RotationMeasure,
     Weights,
     adaptive_weights,
@@ -53,6 +55,7 @@ class MetricConfig:
       links: "kept" (a locked joint removes no link) or "merged" (its two links become one chord; paper).
       correspondence: "arc_length" or "overlap" (static), "hard" or "soft" (by distance), or a registered name.
       link_distance: a registered function of two links, in place of the weighted parts; none where empty.
+      reduction: "mean" or "frobenius".
       chains: which chains of trees correspond: "name" (left to left, thumb to thumb) or "order", see `matched_chains`.
     """
 
@@ -65,6 +68,7 @@ class MetricConfig:
     adaptive: bool = False
     rotation_measure: str = "cosine"
     correspondence: str = "arc_length"
+    reduction: str = "mean"
     links: str = "kept"
     link_distance: str = ""
     chains: str = "name"
@@ -76,6 +80,7 @@ class MetricConfig:
         if self.link_distance:
             registry.check("link_distance", self.link_distance, "link_distance")
         check_choice("rotation_measure", self.rotation_measure, ROTATION_MEASURES)
+        check_choice("reduction", self.reduction, REDUCTIONS)
         check_ranges(self, "metric.")
 
     def make_weights(self) -> Weights:
@@ -110,8 +115,8 @@ class MetricConfig:
     def build(self, expert: Embodiment, learner: Embodiment) -> Metric:
         """The metric between two arms."""
         correspondence = self.make_correspondence(expert, learner)
-        rotation = cast(RotationMeasure, self.rotation_measure)
-        return Metric(correspondence, self.make_weights(), rotation, self._hand_weights(expert, learner))
+        rotation, reduction = cast(RotationMeasure, self.rotation_measure), cast(Reduction, self.reduction)
+        return Metric(correspondence, self.make_weights(), rotation, reduction, self._hand_weights(expert, learner))
 
     def compared(self, arm: Embodiment) -> Embodiment:
         """The arm with what this metric compares: without hands where they have no weight."""
@@ -149,7 +154,7 @@ def check_metric(config: MetricConfig) -> DistanceWeights:
       ValueError: a metric other than constant weights with the correspondence by arc length.
     """
     weights = config.make_weights()
-    expected: dict[str, Any] = {"correspondence": "arc_length", "rotation_measure": "cosine"}
+    expected: dict[str, Any] = {"correspondence": "arc_length", "reduction": "mean", "rotation_measure": "cosine"}
     expected |= {"links": "kept", "hand_rotation": 0.0, "hand_position": 0.0}
     different = [f"{key}={getattr(config, key)}" for key, value in expected.items() if getattr(config, key) != value]
     if different or not isinstance(weights, DistanceWeights):

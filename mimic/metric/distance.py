@@ -1,4 +1,4 @@
-"""Distance between two embodiments: distances of link pairs, their weights, and their mean."""
+"""Distance between two embodiments: distances of link pairs, their weights, and the reduction to one number."""
 
 import dataclasses
 import functools
@@ -21,7 +21,9 @@ from mimic.metric.hand import NO_HAND, HandWeights, hand_distance, hand_factors
 from mimic.metric.kinematics import LinkStates
 
 RotationMeasure = Literal["cosine", "angle"]
+Reduction = Literal["mean", "frobenius"]
 ROTATION_MEASURES = ("cosine", "angle")
+REDUCTIONS = ("mean", "frobenius")
 
 _MAX_MATRIX = 1e6  # value of a correspondence
 PARTS = ("translation", "rotation", "linear_velocity", "angular_velocity")
@@ -149,19 +151,22 @@ class Metric:
       correspondence: W [n, n_hat], or a function of the link distances that returns W, such as `hard_correspondence`.
       weights: see `link_distances`.
       rotation: see `link_distances`.
+      reduction: "mean" of all n n_hat entries of W o D' (paper), or their "frobenius" norm.
       hand_weights: of the distance of the hands, which is added, see `hand_distance`.
 
     Raises:
-      ValueError: an unknown rotation measure, or an entry of W or a weight out of range.
+      ValueError: an unknown rotation measure or reduction, or an entry of W or a weight out of range.
     """
 
     correspondence: Correspondence
     weights: Weights
     rotation: RotationMeasure = "cosine"
+    reduction: Reduction = "mean"
     hand_weights: HandWeights = NO_HAND
 
     def __post_init__(self) -> None:
         check_choice("rotation", self.rotation, ROTATION_MEASURES)
+        check_choice("reduction", self.reduction, REDUCTIONS)
         if not callable(self.correspondence) and not isinstance(self.correspondence, Tracer):
             check_matrix("correspondence", np.asarray(self.correspondence))
         _check_weights(self.weights)
@@ -179,9 +184,9 @@ class Metric:
 
     @property
     def is_weighted_sum(self) -> bool:
-        """Whether W and weights are constant, and "cosine" is the measure where hands count."""
+        """Whether W and weights are constant, the reduction "mean", and "cosine" the measure where hands count."""
         constant = not callable(self.correspondence) and isinstance(self.weights, DistanceWeights)
-        return constant and (self.rotation == "cosine" or self.hand_weights.are_zero)
+        return constant and self.reduction == "mean" and (self.rotation == "cosine" or self.hand_weights.are_zero)
 
     def __call__(self, expert_states: LinkStates, learner_states: LinkStates) -> Float[Array, "*batch"]:
         """See `embodiment_distance`."""
@@ -234,8 +239,11 @@ class Metric:
         return matrix
 
     def reduced(self, distances: Float[Array, "expert learner"]) -> Float[Array, ""]:
-        """The mean of all entries of W o D'."""
-        return jnp.mean(self.matrix(distances) * distances)
+        """Reduction of the link distances to one number."""
+        weighted = self.matrix(distances) * distances
+        if self.reduction == "mean":
+            return jnp.mean(weighted)
+        return spatial.safe_sqrt(jnp.sum(weighted * weighted))
 
 
 def embodiment_distance(
@@ -245,9 +253,10 @@ def embodiment_distance(
     weights: Weights,
     *,
     rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
     hand_weights: HandWeights = NO_HAND,
 ) -> Float[Array, "*batch"]:
-    """Distance between two embodiments: the mean of all n n_hat entries of W o D' (paper, Algorithm 1).
+    """Distance between two embodiments: the reduction of W o D' to one number (paper, Algorithm 1).
 
     Args:
       expert_states: link states of the expert. Batch axes before those of a sample broadcast with those of the learner.
@@ -255,12 +264,13 @@ def embodiment_distance(
       correspondence: see `Metric`.
       weights: see `link_distances`.
       rotation: see `link_distances`.
+      reduction: see `Metric`.
       hand_weights: see `Metric`.
 
     Raises:
-      ValueError: W has another shape, an unknown measure, or what `link_distances` rejects.
+      ValueError: W has another shape, an unknown measure or reduction, or what `link_distances` rejects.
     """
-    return Metric(correspondence, weights, rotation, hand_weights)(expert_states, learner_states)
+    return Metric(correspondence, weights, rotation, reduction, hand_weights)(expert_states, learner_states)
 
 
 def pair_distances(a: LinkStates, b: LinkStates, measure: RotationMeasure) -> PairDistances:

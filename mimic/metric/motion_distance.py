@@ -20,6 +20,7 @@ from mimic.metric.distance import (
     PAPER_WEIGHTS,
     Correspondence,
     Metric,
+    Reduction,
     RotationMeasure,
     Weights,
 )
@@ -38,6 +39,7 @@ def motion_distance(
     weights: Weights = PAPER_WEIGHTS,
     *,
     rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
     hand_weights: HandWeights = NO_HAND,
 ) -> MotionDistance:
     """Returns a function (expert_qpos, expert_qvel, learner_qpos, learner_qvel) -> embodiment distance.
@@ -45,7 +47,7 @@ def motion_distance(
     The function equals `embodiment_distance` of both arms' `link_states`. Batch axes before that of the joints
     broadcast. Create it once for two arms: their constants are then folded into it.
 
-    A static metric (constant W and weights, rotation "cosine") has its own implementation. It skips
+    A static metric (constant W and weights, rotation "cosine", reduction "mean") has its own implementation. It skips
     pairs of links that do not correspond and parts of weight 0. Its gradient is in closed form, in forward and reverse
     mode, and only with respect to the differentiated arguments. A batch of the function, or `jax.vmap` of its gradient,
     is one kernel on NVIDIA GPUs.
@@ -59,6 +61,7 @@ def motion_distance(
       correspondence: see `embodiment_distance`.
       weights: see `embodiment_distance`.
       rotation: see `embodiment_distance`.
+      reduction: see `embodiment_distance`.
       hand_weights: see `embodiment_distance`.
 
     Returns:
@@ -67,7 +70,7 @@ def motion_distance(
     Raises:
       ValueError: what `embodiment_distance` rejects.
     """
-    arms, metric = (expert, learner), Metric(correspondence, weights, rotation, hand_weights)
+    arms, metric = (expert, learner), Metric(correspondence, weights, rotation, reduction, hand_weights)
 
     def composed(*motion: Array) -> Array:
         states = link_states(expert, *motion[:2]), link_states(learner, *motion[2:])

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.link_match import hand_poses
 from mimic.arms.pose_limits import continuous_joints
-from mimic.metric.distance import NO_HAND, Correspondence, HandWeights, Metric, RotationMeasure, Weights
+from mimic.metric.distance import NO_HAND, Correspondence, HandWeights, Metric, Reduction, RotationMeasure, Weights
 from mimic.retargeting.hand_speeds import speeds_needed
 from mimic.retargeting.hand_target import POSITION_TOLERANCE, Placement, placement
 from mimic.retargeting.pose import checked_poses, imitate_pose
@@ -35,6 +35,7 @@ def find_base(
     weights: Weights,
     *,
     rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
     hand_weights: HandWeights = NO_HAND,
     largest_jump: Float[ArrayLike, " learner_joints"] | float = 0.3,
     seed: int = 0,
@@ -53,6 +54,7 @@ def find_base(
       correspondence: see `embodiment_distance`.
       weights: see `embodiment_distance`.
       rotation: see `embodiment_distance`.
+      reduction: see `embodiment_distance`.
       hand_weights: see `embodiment_distance`.
       largest_jump: see `imitate_trajectory`.
       seed: of the search.
@@ -70,7 +72,7 @@ def find_base(
     poses, longest = np.concatenate(paths), paths[0]
     steps = np.concatenate([np.diff(path, axis=0, append=path[-1:]) for path in paths])
     jump = np.broadcast_to(np.asarray(largest_jump, float), (learner.num_joints,))
-    metric = Metric(correspondence, weights, rotation, hand_weights)
+    metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
     places, part = _places(expert, poses), _FRAMES // 3
     speed = np.linalg.norm(_places(expert, poses + steps) - places, axis=1)
     fast = _spread(places, np.flatnonzero(speed >= np.quantile(speed, 1 - _FAST)), part)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import pose_limits
 from mimic.base.compilation import compiled_once
-from mimic.metric.distance import Correspondence, Metric, RotationMeasure, Weights
+from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.hand import NO_HAND, HandWeights
 from mimic.metric.kinematics import LinkStates, link_states
 from mimic.retargeting.pose import shared_joints
@@ -53,6 +53,7 @@ def kinematic_bound(
     weights: Weights,
     *,
     rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
     hand_weights: HandWeights = NO_HAND,
     starts: int = 5,
     iterations: int = 20,
@@ -71,6 +72,7 @@ def kinematic_bound(
         correspondence,
         weights,
         rotation=rotation,
+        reduction=reduction,
         hand_weights=hand_weights,
         starts=starts,
         iterations=iterations,
@@ -88,6 +90,7 @@ def closest_motion(
     weights: Weights,
     *,
     rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
     hand_weights: HandWeights = NO_HAND,
     starts: int = 5,
     iterations: int = 20,
@@ -119,6 +122,7 @@ def closest_motion(
       correspondence: see `embodiment_distance`.
       weights: see `embodiment_distance`.
       rotation: see `embodiment_distance`.
+      reduction: see `embodiment_distance`.
       hand_weights: see `embodiment_distance`.
       starts: number of random initial guesses for each step; more, and more random hops, for T below 26, where steps
         have few neighbours.
@@ -136,7 +140,7 @@ def closest_motion(
     if starts < 1 or iterations < 1:
         raise ValueError(f"starts, iterations: expected at least 1, got {starts} and {iterations}")
 
-    metric = Metric(correspondence, weights, rotation, hand_weights)
+    metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
     return _motion_solver(expert, learner, metric, starts, iterations, seed)(qpos, qvel)
 
 

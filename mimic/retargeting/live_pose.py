@@ -176,7 +176,7 @@ class LivePose:
 
     def __init__(self, leader: ArmRows, follower: ArmRows, pairs: np.ndarray, metric: Metric):
         if not metric.is_weighted_sum:
-            raise ValueError("metric: expected a constant correspondence and constant weights")
+            raise ValueError("metric: expected a constant correspondence, constant weights and the reduction mean")
         factors = np.asarray(metric.factors(leader.hands, follower.hands))[:, : leader.links, : follower.links]
         translation, rotation = (factors[PARTS.index(part)] for part in ("translation", "rotation"))
         self._translation, self._rotation = _POSTURE * translation, _POSTURE * np.pi / 2 * rotation.T

@@ -18,7 +18,7 @@ from mimic.arms.pose_limits import continuous_joints, pose_limits
 from mimic.base.compilation import compiled_once
 from mimic.base.config import check_choice
 from mimic.base.spatial import array_library
-from mimic.metric.distance import Correspondence, DistanceWeights, Metric, RotationMeasure, Weights
+from mimic.metric.distance import Correspondence, DistanceWeights, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.hand import NO_HAND, HandWeights
 from mimic.metric.kinematics import resting_link_states
 from mimic.retargeting.costs import NO_COSTS, Costs, with_costs
@@ -70,6 +70,7 @@ def imitate_pose(
     iterations: int = ITERATIONS,
     kept: int | None = 2,
     rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
     hand_weights: HandWeights = NO_HAND,
     costs: Costs | None = None,
     capsules: Capsules | None = None,
@@ -109,6 +110,7 @@ def imitate_pose(
       kept: number of best descents that continue after a third of the iterations. None continues all, which doubles
         the computation; on a GPU it halves the compilation.
       rotation: see `embodiment_distance`.
+      reduction: see `embodiment_distance`.
       hand_weights: see `embodiment_distance`.
       costs: see `Costs`; None for the embodiment distance alone. The returned distance is without them.
       capsules: of the learner, from `fit_capsules`, for the costs of collisions.
@@ -131,7 +133,7 @@ def imitate_pose(
             "costs: expected velocity and acceleration of 0 for single poses; imitate_trajectory takes them"
         )
     warm = None if warm_start is None else checked_poses(learner, _concrete(warm_start), "warm_start")
-    metric = Metric(correspondence, weights, rotation, hand_weights)
+    metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
     descents = Descents(iterations, kept)
     dtype = jax.dtypes.canonicalize_dtype(poses.dtype)
     if hand == "exact":
@@ -238,8 +240,8 @@ def _data_of(expert: Any, learner: Any, metric: Metric, costs: Costs, dtype: Any
         raise ValueError("expert, learner: expected two embodiments or two arms as data, got one of each")
     if not metric.is_weighted_sum or costs != NO_COSTS:
         raise ValueError(
-            "metric, costs: expected a constant correspondence and weights, and no costs for arms as "
-            "data; embodiments take all"
+            "metric, costs: expected a constant correspondence and weights, the reduction mean and no costs for arms "
+            "as data; embodiments take all"
         )
     shape = metric.correspondence.shape  # type: ignore[union-attr]
     if isinstance(metric.correspondence, Tracer):

@@ -15,7 +15,7 @@ from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints, pose_limits
 from mimic.base.compilation import compiled_once, has_tracer
-from mimic.metric.distance import Correspondence, Metric, RotationMeasure, Weights
+from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.hand import NO_HAND, HandWeights
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.closed_form import ROUGH_SMOOTHING
@@ -57,6 +57,7 @@ def imitate_trajectory(
     starts: int | None = None,
     key: Array | None = None,
     rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
     hand_weights: HandWeights = NO_HAND,
     costs: Costs | None = None,
     capsules: Capsules | None = None,
@@ -83,6 +84,7 @@ def imitate_trajectory(
       starts: see `imitate_pose`.
       key: see `imitate_pose`.
       rotation: see `embodiment_distance`.
+      reduction: see `embodiment_distance`.
       hand_weights: see `embodiment_distance`.
       costs: see `Costs`; None for the embodiment distance alone. Those of velocity and acceleration are minimised pose
         by pose, each against the two poses before it. The returned distance is without costs.
@@ -103,7 +105,7 @@ def imitate_trajectory(
     costs = Costs() if costs is None else costs
     costs.check_capsules(capsules)
     jump = jnp.broadcast_to(jnp.asarray(largest_jump, poses.dtype), (learner.num_joints,))
-    metric = Metric(correspondence, weights, rotation, hand_weights)
+    metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
     capsules = capsules if costs.of_capsules else None
     if hand == "exact":
         if has_tracer(poses):

@@ -8,7 +8,7 @@ from jax.typing import DTypeLike
 
 from mimic.arms.embodiment import planar_arm
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence
-from mimic.metric.distance import DistanceWeights, RotationMeasure, adaptive_weights
+from mimic.metric.distance import DistanceWeights, Reduction, RotationMeasure, adaptive_weights
 from mimic.metric.kinematics import link_states
 
 ALL_WEIGHTS = DistanceWeights(translation=2.0, rotation=1.0, linear_velocity=3.0, angular_velocity=0.5)
@@ -27,6 +27,7 @@ WEIGHTS = {
     "adaptive": adaptive_weights,
 }
 MEASURES: tuple[RotationMeasure, ...] = ("cosine", "angle")
+REDUCTIONS: tuple[Reduction, ...] = ("mean", "frobenius")
 
 
 _link_states = jax.jit(link_states)

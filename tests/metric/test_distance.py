@@ -27,6 +27,7 @@ from tests.helpers.metric_cases import (
     EXPERT,
     LEARNER,
     MEASURES,
+    REDUCTIONS,
     WEIGHTS,
     states,
 )
@@ -75,6 +76,7 @@ def test_embodiment_distance_by_hand(x64):
     arm = planar_arm([1.0, 1.0])
     overlap = overlap_correspondence(arm, arm)  # 2 I
     assert distance(overlap) == pytest.approx((2 * 1.25 + 2 * link_2) / 4, rel=1e-14)  # a few roundings
+    assert distance(overlap, reduction="frobenius") == pytest.approx(np.hypot(2.5, 2 * link_2), rel=1e-14)
     # rows: link 1 to 1, link 2 to 1 (first of a tie); columns: 1 to link 1, 2 to link 1
     nudged = dataclasses.replace(learner, position=learner.position.at[1, 1].add(-1e-9))  # breaks the tie for link 1
     hard = embodiment_distance(expert, nudged, hard_correspondence, ALL_WEIGHTS)
@@ -102,10 +104,11 @@ def test_zero_exactly_at_a_match_and_only_there(weights, rotation):
         assert not np.diag(itself).any()
     else:
         np.testing.assert_allclose(np.diag(itself), 0, atol=1e-6)  # |e x e| rounds to 1e-7 in float32
-    overlap = overlap_correspondence(arm, arm)
-    distance = functools.partial(embodiment_distance, here, weights=weights, rotation=rotation)
-    assert distance(here, overlap) == pytest.approx(0, abs=0 if rotation == "cosine" else 1e-5)  # as above
-    assert distance(elsewhere, overlap) > 0.01
+    for reduction in REDUCTIONS:
+        overlap = overlap_correspondence(arm, arm)
+        distance = functools.partial(embodiment_distance, here, weights=weights, rotation=rotation, reduction=reduction)
+        assert distance(here, overlap) == pytest.approx(0, abs=0 if rotation == "cosine" else 1e-5)  # as above
+        assert distance(elsewhere, overlap) > 0.01
 
 
 def test_candidate_points_are_compared_by_place_and_velocity():
@@ -143,8 +146,12 @@ def test_a_batch_is_a_vmap_is_a_loop(correspondence):
 )
 def test_float32_stays_float32_under_x64(x64, correspondence, weights):
     args = {"correspondence": CORRESPONDENCES[correspondence], "weights": WEIGHTS[weights]}
-    pair = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, np.float32), (states(EXPERT), states(LEARNER)))
-    assert jax.eval_shape(functools.partial(embodiment_distance, **args), *pair).dtype == np.float32
+    for dtype, reduction in ((np.float32, "mean"), (np.float32, "frobenius")):
+        function = functools.partial(embodiment_distance, reduction=reduction, **args)
+        pair = jax.tree.map(
+            lambda x, dtype=dtype: jax.ShapeDtypeStruct(x.shape, dtype), (states(EXPERT), states(LEARNER))
+        )
+        assert jax.eval_shape(function, *pair).dtype == dtype
     double = dataclasses.replace(ALL_WEIGHTS, rotation=np.float64(1.0))
     assert link_distances(states(EXPERT), states(LEARNER), double).dtype == np.float32
 
@@ -165,10 +172,14 @@ def test_a_correspondence_of_another_shape_is_rejected(matrix):
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_unknown_measures_are_rejected():
+def test_unknown_measures_and_reductions_are_rejected():
     pair = states(EXPERT), states(LEARNER)
+    options = {"rotation": ("cosine, angle", "euler"), "reduction": ("mean, frobenius", "sum")}
+    for option, (valid, bad) in options.items():
+        with pytest.raises(ValueError, match=f"^{option}: expected one of {valid}, got '{bad}'$"):
+            wrong: dict = {option: bad}
+            embodiment_distance(*pair, hard_correspondence, PAPER_WEIGHTS, **wrong)
     for call in (
-        lambda: embodiment_distance(*pair, hard_correspondence, PAPER_WEIGHTS, rotation="Angle"),  # pyright: ignore[reportArgumentType]
         lambda: link_distances(*pair, adaptive_weights, rotation="Angle"),  # pyright: ignore[reportArgumentType]
         lambda: rotation_distance(jnp.ones(3), jnp.ones(3), "Angle"),  # pyright: ignore[reportArgumentType]
     ):

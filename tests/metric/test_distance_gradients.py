@@ -11,18 +11,19 @@ from tests.helpers.metric_cases import (
     EXPERT,
     LEARNER,
     MEASURES,
+    REDUCTIONS,
     WEIGHTS,
     states,
 )
 
 
 def distances_of(combinations):
-    """Distance by (correspondence, weights, measure), a function of states [4, n, 3] of both arms."""
+    """Distance by (correspondence, weights, measure, reduction), a function of states [4, n, 3] of both arms."""
 
     def distances(a, b):
         pair = LinkStates(*a), LinkStates(*b)
         return jnp.stack(
-            [embodiment_distance(*pair, c, w, rotation=m) for c, w, m in combinations],
+            [embodiment_distance(*pair, c, w, rotation=m, reduction=r) for c, w, m, r in combinations],
         )
 
     return distances
@@ -50,14 +51,14 @@ def central_differences(function, point, step):
     return ((ahead - behind) / (2 * step)).T.reshape(-1, *point.shape)
 
 
-# Every correspondence, weight and measure once.
+# Every correspondence, weight, measure and reduction once.
 COVER = [
-    ("overlap", "constant", "cosine"),
-    ("hard", "adaptive", "angle"),
-    ("soft", "matrix", "angle"),
-    ("matrix", "adaptive", "cosine"),
+    ("overlap", "constant", "cosine", "mean"),
+    ("hard", "adaptive", "angle", "mean"),
+    ("soft", "matrix", "angle", "frobenius"),
+    ("matrix", "adaptive", "cosine", "frobenius"),
 ]
-METRICS = [(CORRESPONDENCES[c], WEIGHTS[w], measure) for c, w, measure in COVER]
+METRICS = [(CORRESPONDENCES[c], WEIGHTS[w], *options) for c, w, *options in COVER]
 
 
 def test_gradients_equal_finite_differences(x64):
@@ -74,10 +75,10 @@ def test_gradients_equal_finite_differences(x64):
 
 def test_gradients_are_finite_at_the_kinks():
     matching = np.array([[2, 0], [0, 2], [0, 0]])  # the links that match in the first two pairs of states
-    at_a_match = [(matching, WEIGHTS["constant"], measure) for measure in MEASURES]
+    at_a_match = [(matching, WEIGHTS["constant"], *options) for options in zip(MEASURES, REDUCTIONS, strict=True)]
     function = distances_of([*at_a_match, *METRICS])
     gradient = jax.jit(jax.vmap(jax.jacrev(function, argnums=1)))(*singular_states(np.float32))
     assert gradient.dtype == np.float32
     assert np.all(np.isfinite(gradient))
     assert abs(gradient).max() < 100  # a norm's slope is 1, weights are up to 3
-    assert not gradient[:2, 0].any()  # of the cosine; an angle has a kink there
+    assert not gradient[:2, : len(at_a_match)].any()

@@ -60,7 +60,7 @@ def test_value_and_gradient_equal_those_of_the_composition(x64, pair, weights):
 def test_other_metrics_equal_the_composition(x64):
     metric, arms = (CORRESPONDENCES["overlap"], ALL_WEIGHTS), (EXPERT, LEARNER)
     sample = [x[0] for x in motions(arms)]
-    several: tuple[dict, ...] = {}, {"rotation": "angle"}
+    several: tuple[dict, ...] = {}, {"rotation": "angle"}, {"reduction": "frobenius"}
     for options in several:
         functions = motion_distance(*arms, *metric, **options), composed(arms, *metric, **options)
         actual, expected = (jax.jit(function)(*sample) for function in functions)

@@ -157,10 +157,10 @@ def test_velocities_of_any_size_are_found():
 @pytest.mark.parametrize(
     "correspondence, weights, options",
     [
-        (lambda d: soft_correspondence(d, xi=-5.0), PAPER_WEIGHTS, {}),
+        (lambda d: soft_correspondence(d, xi=-5.0), PAPER_WEIGHTS, {"reduction": "frobenius"}),
         (hard_correspondence, adaptive_weights, {"rotation": "angle"}),
     ],
-    ids=["soft", "hard adaptive angle"],
+    ids=["soft frobenius", "hard adaptive angle"],
 )
 def test_correspondence_and_weights_may_depend_on_the_distances(correspondence, weights, options):
     expert, learner = ARMS["panda 7->4"]

@@ -133,16 +133,17 @@ OVERLAP = overlap_correspondence(panda(), panda())
 
 
 @pytest.mark.parametrize(
-    ("correspondence", "weights", "rotation", "is_closed"),
+    ("correspondence", "weights", "rotation", "reduction", "is_closed"),
     [
-        (OVERLAP, DEFAULT, "cosine", True),
-        (OVERLAP, DIRECTIONS, "angle", True),
-        (OVERLAP, adaptive_weights, "cosine", False),
-        (hard_correspondence, DIRECTIONS, "cosine", False),
+        (OVERLAP, DEFAULT, "cosine", "mean", True),
+        (OVERLAP, DIRECTIONS, "angle", "mean", True),
+        (OVERLAP, DIRECTIONS, "cosine", "frobenius", False),
+        (OVERLAP, adaptive_weights, "cosine", "mean", False),
+        (hard_correspondence, DIRECTIONS, "cosine", "mean", False),
     ],
 )
-def test_only_weighted_sums_have_the_closed_form(correspondence, weights, rotation, is_closed):
+def test_only_weighted_sums_have_the_closed_form(correspondence, weights, rotation, reduction, is_closed):
     arm = panda()
-    objective = pose_objective(arm, Metric(correspondence, weights, rotation))
+    objective = pose_objective(arm, Metric(correspondence, weights, rotation, reduction))
     states = link_states(arm, jnp.zeros(7))
     assert (objective.target(states) is not states) == is_closed

@@ -95,7 +95,7 @@ def test_the_metadata_describes_inputs_and_outputs(policy):
     assert max(part["stop"] for part in layout.values()) == env.observation_size
 
 
-OTHER_METRIC = {"translation": 1.0, "correspondence": "soft", "rotation_measure": "angle"}
+OTHER_METRIC = {"translation": 1.0, "correspondence": "soft", "rotation_measure": "angle", "reduction": "frobenius"}
 
 
 @pytest.mark.slow_for("planar4dof-large-metric1", "panda3dof-large-metric2", "short-large-metric3")
