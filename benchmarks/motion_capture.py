@@ -113,7 +113,7 @@ def mapped(case: Case) -> np.ndarray:
             lambda: (poses, poses[: settings.validation_poses]),
             Path(folder),
             seed=0,
-            on_evaluation=lambda *_: False,
+            on_evaluation=lambda *_: None,
             signals=Signals(),
         )
     return np.asarray(model.of_poses(params, jnp.asarray(case.qpos, jnp.float32)))

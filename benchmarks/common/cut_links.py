@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.chain_match import ChainMatch, matched_chains
+from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment, segment_arm
 
 _SHORTEST = 1e-3  # of a chain, that a cut leaves of a segment
 
 
-def cut_alike(expert: Embodiment, learner: Embodiment, *, chains: ChainMatch = "name") -> tuple[Embodiment, Embodiment]:
+def cut_alike(expert: Embodiment, learner: Embodiment) -> tuple[Embodiment, Embodiment]:
     """Both arms with links that are cut where a corresponding chain of the other arm has a vertex.
 
     By arc length, overlapping links then cover the same interval of their chains, and have their middles at the same
@@ -20,7 +20,6 @@ def cut_alike(expert: Embodiment, learner: Embodiment, *, chains: ChainMatch = "
     Args:
       expert: the first arm; joints and shape stay as they are, links are pieces of straight segments.
       learner: the second arm, likewise.
-      chains: see `matched_chains`.
 
     Raises:
       ValueError: trees whose chains do not match.
@@ -28,7 +27,7 @@ def cut_alike(expert: Embodiment, learner: Embodiment, *, chains: ChainMatch = "
     arms = segment_arm(expert), segment_arm(learner)
     vertices = [[_vertices(arm, chain) for chain in arm.chains] for arm in arms]
     cuts: list[list[set[float]]] = [[{0.0, 1.0} for _ in arm.segment_link] for arm in arms]
-    for pair in matched_chains(expert.chain_names, learner.chain_names, chains):
+    for pair in matched_chains(expert.chain_names, learner.chain_names):
         for own in (0, 1):
             chain, own_vertices = arms[own].chains[pair[own]], vertices[own][pair[own]]
             _add_cuts(cuts[own], chain, own_vertices, vertices[1 - own][pair[1 - own]])

@@ -2,13 +2,8 @@
 
 import re
 from collections.abc import Sequence
-from typing import Literal
 
 from mimic.arms.names import side, words
-from mimic.base.config import check_choice
-
-ChainMatch = Literal["name", "order"]
-CHAIN_MATCHES = ("name", "order")
 
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
 _CODES: dict[str, str] = dict(zip(("th", "ff", "mf", "rf", "lf"), _FINGERS, strict=True))  # of the Shadow hand
@@ -16,29 +11,24 @@ _OTHER_WORDS = {"pinky": "little", "pinkie": "little", "forefinger": "index"}
 _ENDS = "|".join(("", "tip", "distal", "j"))  # what follows the code of a finger
 
 
-def matched_chains(
-    expert: Sequence[str], learner: Sequence[str], by: ChainMatch = "name"
-) -> tuple[tuple[int, int], ...]:
+def matched_chains(expert: Sequence[str], learner: Sequence[str]) -> tuple[tuple[int, int], ...]:
     """Pairs of chains (expert, learner) that correspond.
 
-    By name, these are the chains whose names have the same side and finger, where only one chain of each embodiment has
+    These are the chains whose names have the same side and finger, where only one chain of each embodiment has
     them: left_hand and l_wrist, thumb and robot0:thdistal. Chains without a counterpart stay alone. Where no names
-    match, and by order, it is the first with the first, and so on.
+    match, it is the first with the first, and so on.
 
     Args:
       expert: names of the expert's chains.
       learner: names of the learner's chains.
-      by: "name" or "order".
 
     Raises:
-      ValueError: an unknown way, or numbers of chains that differ where no names match.
+      ValueError: numbers of chains that differ where no names match.
     """
-    check_choice("chains", by, CHAIN_MATCHES)
-    if by == "name":
-        sides = [[_label(name) for name in names] for names in (expert, learner)]
-        unique = [label for label in sides[0] if any(label) and all(labels.count(label) == 1 for labels in sides)]
-        if unique:
-            return tuple((sides[0].index(label), sides[1].index(label)) for label in unique)
+    sides = [[_label(name) for name in names] for names in (expert, learner)]
+    unique = [label for label in sides[0] if any(label) and all(labels.count(label) == 1 for labels in sides)]
+    if unique:
+        return tuple((sides[0].index(label), sides[1].index(label)) for label in unique)
     if len(expert) != len(learner):
         raise ValueError(
             f"chains: expected as many chains of the expert as of the learner, or names with the same sides or "

@@ -52,8 +52,7 @@ class EvaluateConfig:
       demonstrations: file of demonstrations that replace the held-out ones; episodes have their length.
       split: "test": the test set replaces the held-out demonstrations, see `test_demonstrations`. Default "": none.
       physics: see `EnvConfig`. Default "": that of the run.
-      mass, damping, torque_noise: deviation of the arm from its model, see `RandomizationConfig`. Default None: as in
-        training.
+      mass, damping: factors on the arm's model, see `RandomizationConfig`. Default None: as in training.
       robot: "virtual_panda": the policy, or "tracking", controls virtual Pandas in C MuJoCo, which abort as real ones
         do; "virtual_robot": the same for another learner. Default "": the environment of the run.
       episodes: number of episodes of `robot`, of each case with `edges`.
@@ -76,7 +75,6 @@ class EvaluateConfig:
     physics: str = ""
     mass: float | None = _factor()
     damping: float | None = _factor()
-    torque_noise: float | None = number(None, at_least=0.0, at_most=10.0)
     robot: str = ""
     episodes: int = number(1000, at_least=1, at_most=10_000_000)
     robot_world: str = ""
@@ -112,7 +110,7 @@ class EvaluateConfig:
             raise ValueError(
                 f"controller: expected {' or '.join(ROBOT_CONTROLLERS)} with robot=, got {self.controller}"
             )
-        others = "learner", "physics", "mass", "damping", "torque_noise"
+        others = "learner", "physics", "mass", "damping"
         check_unused(self, others, "with robot=, whose world has ranges of masses, damping and friction")
 
 

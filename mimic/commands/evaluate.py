@@ -101,14 +101,12 @@ def prepare_report(config: EvaluateConfig, started: float, console: Console) -> 
 def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Trainer]:
     """The trainer of a run, with the demonstrations, the physics and the arm parameters of the evaluation."""
     factors = {"mass": config.mass, "damping": config.damping}
-    changes: dict[str, Any] = {key: [value, value] for key, value in factors.items() if value is not None}
-    if config.torque_noise is not None:
-        changes["torque_noise"] = config.torque_noise
+    changes = {key: [value, value] for key, value in factors.items() if value is not None}
     if trained.trainer.name != "ppo":
         others = config.physics, config.demonstrations, config.split, config.learner
         if changes or any(others) or config.controller != "policy":
             raise ValueError(
-                "controller, learner, demonstrations, split, physics, mass, damping, torque_noise: expected a run of "
+                "controller, learner, demonstrations, split, physics, mass, damping: expected a run of "
                 f"trainer=ppo, got one of {trained.trainer.name}"
             )
         return trained, make_trainer(trained, run_dir)

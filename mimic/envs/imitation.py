@@ -38,9 +38,8 @@ from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
 # The limit penalty starts this margin inside a limit and is at its maximum a width further out; in rad for positions,
 # as a fraction of the velocity limit for speeds.
 _LIMIT_MARGIN, _LIMIT_WIDTH = 0.03, 0.1
-# Numbers that are folded into an episode's key, for its noise and for the step it starts at. 0 to 2 would give the keys
-# that `start` splits the key into.
-_NOISE, FIRST_STEP = 3, 4
+# Folded into an episode's key for the step it starts at; 0 to 2 would give the keys that `start` splits the key into.
+FIRST_STEP = 4
 _FORESIGHT = 3, 6, 10  # steps ahead at which a critic knows the expert
 TEST_SETS, TEST_COUNT = 5, 128  # demonstrations of each kind in a set
 
@@ -262,21 +261,16 @@ class ImitationEnv(Env):
         self, before: ArmState, command: Float[Array, " numbers"]
     ) -> tuple[ArmState, Float[Array, " joints"]]:
         """The state after a control step of an action in [-1, 1], and the torque in it [N m], which is constant."""
-        step, randomization = before.step + 1, self.config.randomization
-        torque = command
-        if randomization.torque_noise:
-            key_noise = jax.random.fold_in(jax.random.fold_in(before.key, _NOISE), step)
-            noise = jax.random.normal(key_noise, command.shape)
-            torque = jnp.clip(command + randomization.torque_noise * noise, -1.0, 1.0)
+        randomization = self.config.randomization
         load = Load(randomization.mass[0], randomization.damping[0]) if before.load is None else before.load
-        torque = torque * self.torque_scale
+        torque = command * self.torque_scale
         qpos, qvel = self._advance(before.qpos, before.qvel, torque, load)
-        return dataclasses.replace(before, qpos=qpos, qvel=qvel, step=step), torque
+        return dataclasses.replace(before, qpos=qpos, qvel=qvel, step=before.step + 1), torque
 
     def commanded_torque(
         self, before: ArmState, after: ArmState, action: Float[Array, " numbers"]
     ) -> Float[Array, " joints"]:
-        """The torque that an action commands in the control step from one state to the next [N m], without noise."""
+        """The torque that an action commands in the control step from one state to the next [N m]."""
         del after
         return self.command(before, action)
 

@@ -248,8 +248,6 @@ def _check(config: EnvConfig) -> None:
         )
     if config.observed_terms:
         raise ValueError(f"observation.terms: expected none with an inner loop, got {config.observed_terms}")
-    if config.randomization.torque_noise:
-        raise ValueError("randomization.torque_noise: expected 0 with an inner loop; world.motor_gain is there")
 
 
 def _pushed(history: Float[Array, "ticks numbers"], newest: Float[Array, " numbers"]) -> Float[Array, "ticks numbers"]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.chain import LINKS
-from mimic.arms.chain_match import CHAIN_MATCHES, ChainMatch, matched_chains
+from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment, without_hands
 from mimic.arms.link_match import LinkMatch
 from mimic.base import registry
@@ -56,7 +56,6 @@ class MetricConfig:
       correspondence: "arc_length" or "overlap" (static), "hard" or "soft" (by distance), or a registered name.
       link_distance: a registered function of two links, in place of the weighted parts; none where empty.
       reduction: "mean" or "frobenius".
-      chains: which chains of trees correspond: "name" (left to left, thumb to thumb) or "order", see `matched_chains`.
     """
 
     translation: float = weight_number(1.0)
@@ -71,11 +70,9 @@ class MetricConfig:
     reduction: str = "mean"
     links: str = "kept"
     link_distance: str = ""
-    chains: str = "name"
 
     def __post_init__(self) -> None:
         check_choice("links", self.links, LINKS)
-        check_choice("chains", self.chains, CHAIN_MATCHES)
         registry.check("correspondence", self.correspondence, "correspondence")
         if self.link_distance:
             registry.check("link_distance", self.link_distance, "link_distance")
@@ -98,10 +95,9 @@ class MetricConfig:
         Raises:
           ValueError: a matrix of a registered function that does not fit the arms.
         """
-        chains = cast(ChainMatch, self.chains)
         constructors: dict[str, Callable[[], Correspondence]] = {
-            "arc_length": lambda: arc_length_correspondence(expert, learner, chains=chains),
-            "overlap": lambda: overlap_correspondence(expert, learner, chains=chains),
+            "arc_length": lambda: arc_length_correspondence(expert, learner),
+            "overlap": lambda: overlap_correspondence(expert, learner),
             "hard": lambda: hard_correspondence,
             "soft": lambda: partial(soft_correspondence, xi=SOFT_SHARPNESS),
         }
@@ -126,7 +122,7 @@ class MetricConfig:
         weights = HandWeights(self.hand_rotation, self.hand_position)
         if weights.are_zero or not expert.hand_joint or not learner.hand_joint:
             return NO_HAND
-        pairs = matched_chains(expert.chain_names, learner.chain_names, cast(ChainMatch, self.chains))
+        pairs = matched_chains(expert.chain_names, learner.chain_names)
         return dataclasses.replace(weights, pairs=pairs)
 
     def link_fractions(self, expert: Embodiment, learner: Embodiment) -> Float[np.ndarray, "expert learner"]:

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import ArmArrays
-from mimic.arms.chain_match import ChainMatch, matched_chains
+from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment
 
 
@@ -47,29 +47,27 @@ def soft_correspondence(distances: Float[Array, "expert learner"], *, xi: ArrayL
     return jax.nn.softmax(sharpened, axis=1) + jax.nn.softmax(sharpened, axis=0)
 
 
-def overlap_correspondence(
-    expert: Embodiment, learner: Embodiment, *, chains: ChainMatch = "name"
-) -> Float[Array, "expert learner"]:
+def overlap_correspondence(expert: Embodiment, learner: Embodiment) -> Float[Array, "expert learner"]:
     """Static correspondence by the overlap of links along their chains, with the same weight for each link (paper).
 
     Both chains are mapped onto [0, 1]. Links i and j overlap there by a length o_ij, and W_ij = o_ij / l_i + o_ij / l_j
     with the link lengths l. Each row of the first term and each column of the second sums to 1. For two equal arms W is
-    2 I. In trees o_ij is the sum over the pairs of corresponding chains.
+    2 I. In trees o_ij is the sum over the pairs of corresponding chains, see
+    `matched_chains`.
 
     Args:
       expert: n links.
       learner: n_hat links.
-      chains: see `matched_chains`.
 
     Raises:
       ValueError: trees whose chains do not match.
     """
-    overlap, (length_a, length_b), numpy = _overlaps(expert, learner, chains)
+    overlap, (length_a, length_b), numpy = _overlaps(expert, learner)
     return _array(overlap / length_a[:, None] + overlap / length_b[None, :])
 
 
 def arc_length_correspondence(
-    expert: Embodiment | ArmArrays, learner: Embodiment | ArmArrays, *, chains: ChainMatch = "name"
+    expert: Embodiment | ArmArrays, learner: Embodiment | ArmArrays
 ) -> Float[Array, "expert learner"]:
     """Static correspondence by arc length: W_ij = n n_hat o_ij, with o_ij as in `overlap_correspondence`.
 
@@ -80,7 +78,6 @@ def arc_length_correspondence(
     Args:
       expert: n links, or an arm as data.
       learner: n_hat links, or an arm as data if the expert is one; W is 0 for its empty slots of links.
-      chains: see `matched_chains`.
 
     Raises:
       ValueError: trees whose chains do not match.
@@ -88,7 +85,7 @@ def arc_length_correspondence(
     if isinstance(expert, ArmArrays) or isinstance(learner, ArmArrays):
         overlap, numpy = overlaps_of_chains(expert.link_length, learner.link_length, jnp)[0], jnp  # type: ignore[union-attr]
     else:
-        overlap, _, numpy = _overlaps(expert, learner, chains)
+        overlap, _, numpy = _overlaps(expert, learner)
     return _array(overlap.size * overlap / numpy.sum(overlap))
 
 
@@ -97,7 +94,7 @@ def _array(values: Any) -> Array:
     return jnp.asarray(values.astype(jax.dtypes.canonicalize_dtype(values.dtype)))
 
 
-def _overlaps(expert: Embodiment, learner: Embodiment, chains: ChainMatch) -> tuple[Any, Any, ModuleType]:
+def _overlaps(expert: Embodiment, learner: Embodiment) -> tuple[Any, Any, ModuleType]:
     """Overlap of each pair of links on [0, 1], [n, n_hat]; the links' lengths there; and the array library.
 
     In trees, overlaps are summed over pairs of chains, and so are the lengths.
@@ -106,7 +103,7 @@ def _overlaps(expert: Embodiment, learner: Embodiment, chains: ChainMatch) -> tu
     is_constant = all(isinstance(leaf, np.ndarray) for arm in arms for leaf in (arm.link_lengths, arm.segment_start))
     numpy = np if is_constant else jnp
     link_lengths = [_path_lengths(arm, numpy) for arm in arms]
-    pairs = matched_chains(expert.chain_names, learner.chain_names, chains)
+    pairs = matched_chains(expert.chain_names, learner.chain_names)
     if len(expert.chains) == len(learner.chains) == 1:
         return *overlaps_of_chains(link_lengths[0], link_lengths[1], numpy), numpy
     shape = expert.num_links, learner.num_links

@@ -23,13 +23,11 @@ class RandomizationConfig:
     Attributes:
       mass: minimum and maximum factor on the masses and inertias of the learner's bodies.
       damping: minimum and maximum factor on the damping of its joints.
-      torque_noise: standard deviation of the noise on each torque, as a fraction of the maximum torque.
     """
 
     # Beyond these factors the arm is another one, and float32 no longer simulates it.
     mass: list[float] = number(lambda: [1.0, 1.0], at_least=1e-3, at_most=1e3, entries=(2, 2))
     damping: list[float] = number(lambda: [1.0, 1.0], at_least=1e-3, at_most=1e3, entries=(2, 2))
-    torque_noise: float = number(0.0, at_least=0.0, at_most=10.0)
 
     def __post_init__(self) -> None:
         check_ranges(self, "randomization.")

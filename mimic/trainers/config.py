@@ -31,10 +31,6 @@ LOOPS = ("mimic", "brax")
 _WITHOUT_SCHEDULES = {"final_learning_rate": 1.0, "final_entropy_cost": 1.0, "privileged_critic": False}
 LOGGERS = ("local", "wandb")
 
-# Factor on the number of evaluations with a target gap, so that training ends soon after the gap is reached: an
-# evaluation takes less time than the steps between two evaluations.
-_TARGET_GAP_EVALUATIONS = 5
-
 
 @dataclasses.dataclass(frozen=True)
 class TrainerConfig:
@@ -107,10 +103,7 @@ class PPOConfig(TrainerConfig):
       privileged_critic: whether the value network also observes what the policy never does: the elapsed fraction of the
         episode, the expert's future and, in a world with an inner loop, what was drawn for it, see
         `ImitationEnv.privileged`.
-      target_gap: training ends early when the optimality gap on the training demonstrations is at most this; 0 disables
-        it.
-      evaluations: number of evaluations and checkpoints, as far as whole batches allow; with a target gap five times
-        the preset's number.
+      evaluations: number of evaluations and checkpoints, as far as whole batches allow.
       keep: number of newest checkpoints that the run keeps, at least 2: those two can be resumed exactly.
     """
 
@@ -140,7 +133,6 @@ class PPOConfig(TrainerConfig):
     crossovers: FromPreset[int] = number(None, at_least=0, at_most=100_000)
     displaced_crossovers: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
     privileged_critic: bool = True
-    target_gap: float = number(0.0, at_least=0.0, at_most=100.0)
     evaluations: FromPreset[int] = number(None, at_least=1, at_most=1_000_000)
 
     def __post_init__(self) -> None:
@@ -156,8 +148,6 @@ class PPOConfig(TrainerConfig):
         of_backends = PPO_PRESETS_OF["one_arm" if env is None else env.kind]
         name = self.preset if self.preset != "auto" else of_backends[backend != "cpu"]
         preset = PPO_PRESETS[name]
-        if self.target_gap > 0:
-            preset = {**preset, "evaluations": _TARGET_GAP_EVALUATIONS * preset["evaluations"]}
         config = _filled_in(self, preset, preset=name)
         config._check(devices)
         if env is not None and config.network != "mlp" and env.kind != "sampled_arms":

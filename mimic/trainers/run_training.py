@@ -340,7 +340,7 @@ def _train_and_log(
         progress = stack.enter_context(TrainingProgress(console, trainer.total_steps, resumed_step))
         stack.enter_context(stopwatch.stage("train"))
 
-        def on_evaluation(step: int, params: Params, training_metrics: Mapping[str, float]) -> bool:
+        def on_evaluation(step: int, params: Params, training_metrics: Mapping[str, float]) -> None:
             with stopwatch.stage("evaluate"):
                 metrics = trainer.metrics(trainer.evaluate(params))
                 if training_metrics:
@@ -350,6 +350,5 @@ def _train_and_log(
                     for logger in loggers:
                         logger.write(step, row)
                 progress.update(step, trainer.status(metrics), training_metrics.get("sps"))
-            return trainer.good_enough(metrics)
 
         return trainer.train(run_dir, on_evaluation, signals, restored)

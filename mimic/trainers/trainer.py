@@ -12,7 +12,7 @@ from mimic.trainers.config import TrainerConfig
 
 Params = Any  # pytree
 Metrics = dict[str, Any]  # quality metrics of a report, some by split
-OnEvaluation = Callable[[int, Params, Mapping[str, float]], bool]  # (steps, parameters, training metrics) -> stop?
+OnEvaluation = Callable[[int, Params, Mapping[str, float]], None]  # steps, parameters, training metrics
 Row = tuple[str, str, str]  # of the final table: label, value on training data, value on held-out data
 
 
@@ -53,7 +53,7 @@ class Trainer(abc.ABC):
 
         Args:
           run_dir: folder of the checkpoints.
-          on_evaluation: called after each training epoch; training ends when it returns True.
+          on_evaluation: called after each training epoch.
           signals: signals of the process; after one, training ends at the next checkpoint.
           restored: checkpoint to continue from, which is evaluated again. At step 0, if `run_dir` does not
             have it, it has the parameters to start from.
@@ -105,11 +105,6 @@ class Trainer(abc.ABC):
     @abc.abstractmethod
     def status(self, metrics: Metrics) -> str:
         """The most important metrics as a short text, for the progress display."""
-
-    def good_enough(self, metrics: Metrics) -> bool:
-        """Whether a target of the config is reached, so that training may end; never by default."""
-        del metrics
-        return False
 
     @abc.abstractmethod
     def rows(self, metrics: Metrics) -> list[Row]:

@@ -185,7 +185,6 @@ def test_mjx_agrees_with_the_fused_loop():
             "world.action_latency: expected a multiple of 0.001 s below control_dt = 0.02 s, got 0.02",
         ),
         ({"observation": {"terms": ["distance_gradient"]}}, "observation.terms: expected none with an inner loop"),
-        ({"randomization": {"torque_noise": 0.1}}, "randomization.torque_noise: expected 0 with an inner loop"),
         (
             {"world": {"expert": "links", "hidden_links": [0, 7]}, "control": "torque"},
             "fewer than the expert's 7 links",

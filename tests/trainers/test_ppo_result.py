@@ -12,12 +12,11 @@ from mimic.runs.checkpoints import Checkpoint, checkpoint_steps
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import brax_loop, ppo
-from mimic.trainers.ppo.trainer import PPOTrainer
 
 WITHOUT_SCHEDULES: dict[str, Any] = {"final_learning_rate": 1.0, "final_entropy_cost": 1.0, "privileged_critic": False}
 
 
-def run(monkeypatch, run_dir, values, last=None):
+def run(monkeypatch, run_dir, values):
     """Trains where the parameter is one of `values` at each step; returns the result, its steps and those evaluated."""
 
     def checkpoints(*_):
@@ -26,10 +25,6 @@ def run(monkeypatch, run_dir, values, last=None):
 
     evaluated = []
 
-    def on_evaluation(step, _params, _metrics):
-        evaluated.append(step)
-        return step == last
-
     monkeypatch.setattr(ppo, "_checkpoints", checkpoints)
     config = PPOConfig(num_timesteps=len(values)).resolve("cpu")
     step, params = ppo.train(
@@ -37,25 +32,17 @@ def run(monkeypatch, run_dir, values, last=None):
         config,
         run_dir,
         seed=0,
-        on_evaluation=on_evaluation,
+        on_evaluation=lambda step, *_: evaluated.append(step),
         signals=Signals(),
     )
     return step, float(jax.tree.leaves(params)[0][0]), evaluated
 
 
-@pytest.mark.parametrize(("last", "result"), [(None, (3, 4.0, [0, 1, 2, 3])), (2, (2, 3.0, [0, 1, 2]))])
-def test_the_last_checkpoint_or_the_one_that_reached_the_target_is_the_result(monkeypatch, tmp_path, last, result):
-    assert run(monkeypatch, tmp_path, [1.0, 2.0, 3.0, 4.0], last) == result
+def test_the_last_checkpoint_is_the_result(monkeypatch, tmp_path):
+    assert run(monkeypatch, tmp_path, [1.0, 2.0, 3.0, 4.0]) == (3, 4.0, [0, 1, 2, 3])
 
 
-@pytest.mark.parametrize(("train", "held_out", "is_good"), [(0.1, 0.3, True), (0.2, 0.05, False)])
-def test_the_target_is_the_gap_of_the_training_demonstrations(train, held_out, is_good):
-    trainer: Any = SimpleNamespace(settings=PPOConfig(target_gap=0.1))
-    assert PPOTrainer.good_enough(trainer, {"optimality_gap": {"train": train, "held_out": held_out}}) == is_good
-
-
-@pytest.mark.parametrize(("last", "expected"), [(None, (30, 3.0, [0, 10, 20, 30])), (20, (20, 2.0, [0, 10, 20]))])
-def test_the_checkpoints_of_braxs_loop_are_evaluated_and_saved_in_order(monkeypatch, tmp_path, last, expected):
+def test_the_checkpoints_of_braxs_loop_are_evaluated_and_saved_in_order(monkeypatch, tmp_path):
     def loop(*, policy_params_fn, progress_fn, num_evals, **_):
         policy_params_fn(0, None, {"x": np.array([0.0])})
         for epoch in range(1, num_evals):
@@ -69,11 +56,10 @@ def test_the_checkpoints_of_braxs_loop_are_evaluated_and_saved_in_order(monkeypa
     def on_evaluation(step, _params, metrics):
         evaluated.append(step)
         assert metrics == ({"sps": 5.0, "v_loss": 1.0} if step else {})
-        return step == last
 
     arguments: dict[str, Any] = {"seed": 0, "on_evaluation": on_evaluation, "signals": Signals()}
     step, params = brax_loop.train(env, config, tmp_path, **arguments)
-    assert (step, float(params["x"][0]), evaluated) == expected
+    assert (step, float(params["x"][0]), evaluated) == (30, 3.0, [0, 10, 20, 30])
     assert checkpoint_steps(tmp_path)[-1] == step
 
 

@@ -1,6 +1,6 @@
 """Training in several processes: they connect by `jax.distributed`, train in step, and end together.
 
-Only the first process writes, evaluates and may stop early, while the others wait for it in their next training epoch.
+Only the first process writes and evaluates, while the others wait for it in their next training epoch.
 So the first process announces the end of a training through JAX's coordination service. A failure, or a signal that
 only one process received, is announced in the same way. A process that is killed or stopped announces nothing: the
 others end by the errors of their connections to it, or by JAX when its heartbeats stay out.

@@ -69,7 +69,7 @@ def train(
         after the functions of the training have started to compile.
       run_dir: folder of the checkpoints.
       seed: random seed of the network, the order and the fresh poses.
-      on_evaluation: called after each checkpoint; training ends when it returns True.
+      on_evaluation: called after each checkpoint.
       signals: signals of the process; after one, training ends at the next checkpoint.
       restored: the checkpoint to continue from. With the training's state the result is that of a training that was not
         interrupted; without it, the moments of the optimiser start anew.
@@ -101,11 +101,11 @@ def train(
             saved = [np.asarray(leaf) for leaf in jax.tree.leaves(jax.device_get((state, tuple(best))))]
             save_checkpoint(run_dir, steps, state[0], saved, metrics)
             thin_checkpoints(run_dir, config.keep, best.steps)
-        stop = on_evaluation(steps, state[0], metrics)
+        on_evaluation(steps, state[0], metrics)
         signals.check()
         evaluations_since_best = (steps - best.steps) // (interval * config.samples)
         impatient = config.patience and evaluations_since_best >= config.patience
-        if stop or impatient or steps >= config.total_steps:
+        if impatient or steps >= config.total_steps:
             return best.steps, best.params
         run = functions.train()
         began = time.perf_counter()

@@ -1,6 +1,5 @@
 """Training by brax's own PPO loop, on the same environment, networks and checkpoints as `mimic.trainers.ppo.ppo`."""
 
-import contextlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,10 +22,6 @@ SETTINGS = (
     *("num_minibatches", "num_updates_per_batch", "reward_scaling", "clipping_epsilon", "gae_lambda", "max_grad_norm"),
 )
 """Settings of `PPOConfig` that brax's loop has under the same names."""
-
-
-class _Ended(Exception):
-    """Ends the loop, which has no other way to stop early."""
 
 
 def train(
@@ -60,28 +55,25 @@ def train(
             check_finite(checkpoint.step, checkpoint.metrics, checkpoint.params)
             save_checkpoint(run_dir, *checkpoint)
             thin_checkpoints(run_dir, config.keep)
-            stop = on_evaluation(checkpoint.step, checkpoint.params, checkpoint.metrics)
+            on_evaluation(checkpoint.step, checkpoint.params, checkpoint.metrics)
         evaluated = len(checkpoints)
         signals.check()
-        if stop:
-            raise _Ended
 
-    with contextlib.suppress(_Ended):
-        brax_ppo.train(
-            environment=env,
-            wrap_env_fn=wrap_for_training,
-            episode_length=env.config.horizon + 1,
-            normalize_observations=True,
-            network_factory=lambda *_, **__: make_networks(
-                config, env.observation_size, env.action_size, env.privileged_size
-            ),
-            num_evals=config.evaluations + 1,
-            run_evals=False,
-            num_eval_envs=1,
-            seed=seed,
-            restore_params=None if restored is None else restored.params,
-            policy_params_fn=keep,
-            progress_fn=evaluate,
-            **{name: getattr(config, name) for name in SETTINGS},
-        )
+    brax_ppo.train(
+        environment=env,
+        wrap_env_fn=wrap_for_training,
+        episode_length=env.config.horizon + 1,
+        normalize_observations=True,
+        network_factory=lambda *_, **__: make_networks(
+            config, env.observation_size, env.action_size, env.privileged_size
+        ),
+        num_evals=config.evaluations + 1,
+        run_evals=False,
+        num_eval_envs=1,
+        seed=seed,
+        restore_params=None if restored is None else restored.params,
+        policy_params_fn=keep,
+        progress_fn=evaluate,
+        **{name: getattr(config, name) for name in SETTINGS},
+    )
     return checkpoints[-1].step, checkpoints[-1].params

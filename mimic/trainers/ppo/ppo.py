@@ -692,19 +692,17 @@ def train(
       on_compiling: called when the functions of the training start to compile; it may start work in other threads.
     """
     pending: list[Checkpoint] = []
-    stop = False
     for checkpoint in _checkpoints(env, config, seed, restored, on_compiling):
         if checkpoint.step not in checkpoint_steps(run_dir):
             save_checkpoint(run_dir, *checkpoint)
             thin_checkpoints(run_dir, config.keep)
         pending.append(checkpoint)
         if checkpoint.metrics:  # the start is evaluated with the first epoch: the evaluation compiles until then
-            stop = [on_evaluation(each.step, each.params, each.metrics) for each in pending][-1]
+            for each in pending:
+                on_evaluation(each.step, each.params, each.metrics)
             pending.clear()
         if checkpoint.step < config.total_steps:  # a finished training is not interrupted: there is nothing to resume
             signals.check()
-        if stop:
-            break
     return checkpoint.step, checkpoint.params
 
 

@@ -155,12 +155,11 @@ class PPOTrainer(Trainer):
     ) -> tuple[int, Params]:
         """See `ppo.train`."""
 
-        def evaluated(step: int, params: Params, metrics: Mapping[str, float]) -> bool:
-            stop = on_evaluation(step, params, metrics)
+        def evaluated(step: int, params: Params, metrics: Mapping[str, float]) -> None:
+            on_evaluation(step, params, metrics)
             self.evaluator.prepare_baselines()  # not earlier: it would delay the functions of the training
             if self._is_cross_checked:
                 self._rollouts_on_mjx.start()
-            return stop
 
         return self._loop(
             self._env,
@@ -233,10 +232,6 @@ class PPOTrainer(Trainer):
     def status(self, metrics: Metrics) -> str:
         """See `report_rows.status`."""
         return report_rows.status(metrics)
-
-    def good_enough(self, metrics: Metrics) -> bool:
-        """Whether the target gap is reached on the training demonstrations, or by the arms seen in training."""
-        return 0 < self.settings.target_gap >= metrics["optimality_gap"].get("train", np.inf)
 
     def details(self, outcome: Rollouts, controller: str = "policy") -> Metrics:
         """Physics, similarity of the motions and the baselines, and the worst motions, or a row of each arm."""

@@ -222,13 +222,6 @@ def test_there_is_a_gpu_for_each_process_of_a_host(monkeypatch, asked, gpus, pla
 
 
 @pytest.mark.slow
-def test_the_other_processes_end_with_the_first_where_it_is_good_enough(tmp_path):
-    (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run", "trainer.target_gap=100"))
-    assert (first, second) == (0, 0), shown[-2000:] + silent[-2000:]
-    assert json.loads((tmp_path / "run" / "report.json").read_text())["env_steps"] < 5000
-
-
-@pytest.mark.slow
 def test_a_signal_to_one_process_stops_all_after_a_checkpoint(tmp_path):
     processes = start(tmp_path, "run_dir=run", *ENDLESS)
     wait_for_checkpoint(tmp_path, processes)
