@@ -44,6 +44,7 @@ from mimic.metric.capsule_distances import clearance_constants
 from mimic.metric.config import MetricConfig
 from mimic.motions.importing import read_source, source_names
 from mimic.motions.units import in_rad
+from mimic.retargeting.exact_chunks import in_chunks
 from mimic.retargeting.hand_target import placement
 from mimic.retargeting.self_contacts import SelfContacts
 
@@ -70,6 +71,7 @@ BASE = [0.0, 0.115, 0.03, -0.535]  # of the Piper in the SO-101's base frame, fr
 PAIRS = ("panda-ur5e", "ur5e-panda", "so101-panda", "panda-so101", "person-panda")
 FAULTS = ("lost", "stalled", "jumped", "displaced", "not finite", "backwards")
 REDUNDANT = ("iiwa", "kinova3", "jaco")  # followers of a Panda
+CHUNK = 2048  # poses that are compared at a time
 _RATE, _LOST, _TIMED = 100.0, 0.3, 3  # Hz; fraction of samples that are lost; episodes
 
 
@@ -165,14 +167,16 @@ def episodes(options: argparse.Namespace) -> Iterator[Row]:
         operator = mimic.Teleoperator(leader, follower, base=BASE, rate=rate, velocity=SPEED["piper"])
         runs = [driven(operator, path)[0] for path in paths]
         judged = slice(None, None, round(rate / 15))  # as many as were recorded
-        bound = np.concatenate([np.asarray(nearest(chunk).distance) for chunk in chunks(qpos[judged])])
+        bound = np.concatenate(
+            [np.asarray(nearest(chunk).distance) for chunk in in_chunks(qpos[judged].astype(np.float32), CHUNK)]
+        )
         ways = {"mimic": np.concatenate(runs)}
         if rate != _RATE:
             ways["recorded"] = np.concatenate(recorded)
         of_limits = [ratios(run, operator, rate) for run in runs]
         for method, own in ways.items():
             mine, base = method == "mimic", BASE if method == "mimic" else None
-            pairs = zip(chunks(qpos[judged]), chunks(own[judged]), strict=True)
+            pairs = zip(*(in_chunks(x[judged].astype(np.float32), CHUNK) for x in (qpos, own)), strict=True)
             within = np.concatenate([np.asarray(distance(*pair)) for pair in pairs]) <= 1.05 * bound + 1e-6
             row = {"method": method, "rate": rate, "frames": len(qpos)}
             row |= hand_errors(leader, follower, base, qpos, own) | resemblance(leader, follower, base, qpos, own)
@@ -193,11 +197,6 @@ def states(leader: Embodiment, follower: Embodiment, base: Any, qpos: Any, own: 
     rotation = placement(base).rotation.T
     turned = jax.tree.map(lambda x: x @ rotation.T, mimic.link_states(leader, qpos))
     return turned, mimic.link_states(follower, own)
-
-
-def chunks(rows: np.ndarray, size: int = 2048) -> list[np.ndarray]:
-    rows = np.concatenate([rows, np.repeat(rows[-1:], -len(rows) % size, axis=0)]).astype(np.float32)
-    return list(rows.reshape(-1, size, rows.shape[1]))
 
 
 def hand_errors(leader: Embodiment, follower: Embodiment, base: Any, qpos: np.ndarray, own: np.ndarray) -> Row:

@@ -29,6 +29,7 @@ from mimic.evaluation.virtual_robot.robots import LIMIT_CAUSES, SELF_CONTACT
 from mimic.evaluation.virtual_robot.runs import Task, run_tasks
 from mimic.metric.kinematics import link_state_table
 from mimic.physics.world import WorldConfig
+from mimic.retargeting.exact_chunks import by_chunks
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.provenance import hardware, versions
@@ -36,7 +37,7 @@ from mimic.trainers.config import TrainConfig
 from mimic.trainers.ppo.trainer import PPOTrainer
 
 ALL = "all ranges"
-_CHUNK = 500  # episodes whose distances are computed together
+_CHUNK = 500  # episodes, at most, whose distances are computed together
 
 
 def prepare_robot_evaluation(
@@ -156,7 +157,7 @@ def _tracking(evaluator: Evaluator, bundle: Path) -> TrackingPolicy:
 
 def summary(evaluator: Evaluator, episodes: Episodes) -> dict[str, Any]:
     """The numbers of a case. The gap is that of `Evaluator`, over the motions of these episodes."""
-    distance = np.concatenate(list(_distances(evaluator, episodes)))
+    distance = _distances(evaluator, episodes)
     bound, hold = (x[episodes.motion].mean() for x in (evaluator.lower_bound, evaluator.hold_distance))
     aborts, stops = Counter(episodes.aborts.tolist()), Counter(episodes.stops.tolist())
     completed = (episodes.aborts == "") & (episodes.stops == "")
@@ -178,16 +179,17 @@ def summary(evaluator: Evaluator, episodes: Episodes) -> dict[str, Any]:
     }
 
 
-def _distances(evaluator: Evaluator, episodes: Episodes) -> Iterator[np.ndarray]:
-    """The embodiment distance after each tick, [episodes, ticks] in parts."""
+def _distances(evaluator: Evaluator, episodes: Episodes) -> np.ndarray:
+    """The embodiment distance after each tick, [episodes, ticks]."""
     env = evaluator.env
     distance = jax.jit(jax.vmap(jax.vmap(env.states_distance)))
     expert = jax.tree.map(lambda x: np.asarray(x)[:, 1 : env.config.horizon + 1], env.expert_states)
-    for start in range(0, len(episodes.motion), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        motion, qpos, qvel = episodes.motion[part], episodes.qpos[part], episodes.qvel[part]
-        states = link_state_table(env.learner, qpos.astype(np.float32), qvel.astype(np.float32))
-        yield np.asarray(distance(jax.tree.map(lambda x, motion=motion: x[motion], expert), states))
+
+    def of_chunk(motion: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> tuple[jax.Array]:
+        return (distance(jax.tree.map(lambda x: x[motion], expert), link_state_table(env.learner, qpos, qvel)),)
+
+    motions = episodes.motion, episodes.qpos.astype(np.float32), episodes.qvel.astype(np.float32)
+    return by_chunks(of_chunk, *motions, size=min(len(episodes.motion), _CHUNK))[0]
 
 
 def show(console: Console, robot: str, rows: dict[str, dict[str, Any]]) -> None:

@@ -222,7 +222,6 @@ def joint_torque(
     previous: Array,
     joints: JointParameters,
     xp: Any,
-    period: float = PERIOD,
 ) -> Array:
     """Torque of one period [N m], in addition to gravity compensation: PD control of the reference, within limits.
 
@@ -235,7 +234,6 @@ def joint_torque(
       previous: torque of the last period [N m].
       joints: parameters.
       xp: array library.
-      period: [s].
     """
     if mode == "torque":
         torque = target
@@ -243,7 +241,7 @@ def joint_torque(
         torque = joints.stiffness * (reference.qpos - qpos) + joints.damping * (reference.qvel - qvel)
         torque = torque + joints.inertia * reference.qacc + joints.friction * reference.qvel
     torque = _bounded(torque, joints.torque, xp)
-    return previous + _bounded(torque - previous, joints.torque_rate * period, xp)
+    return previous + _bounded(torque - previous, joints.torque_rate * PERIOD, xp)
 
 
 def friction_torque(qvel: Array, level: Array, rate: Array, xp: Any) -> Array:

@@ -10,6 +10,7 @@ from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.base.compilation import on_host
 from mimic.retargeting.costs import Costs
+from mimic.retargeting.exact_chunks import by_chunks
 from mimic.retargeting.pose import imitate_pose
 
 _AT_HOME = 1e-4  # rad
@@ -52,11 +53,12 @@ def _nearest_poses(
     capsules: Capsules | None,
 ) -> Float[np.ndarray, "poses joints"]:
     """The poses nearest to the expert's, see `imitate_pose`."""
-    count = len(qpos)
-    padded = np.asarray(qpos, np.float32)[np.minimum(np.arange(-(-count // _CHUNK) * _CHUNK), count - 1)]
-    chunks = padded.reshape(-1, _CHUNK, expert.num_joints)
     costs = Costs(home=_HOME, self_collision=_SELF_COLLISION if capsules else 0.0, clearance=CLEARANCE)
     options = {"starts": _STARTS, "costs": costs, "capsules": capsules, **metric}
     with on_host():  # compiles several times faster, and runs once
-        poses = [np.asarray(imitate_pose(expert, learner, jnp.asarray(chunk), **options).qpos) for chunk in chunks]
-    return np.concatenate(poses)[:count]
+        (nearest,) = by_chunks(
+            lambda poses: (imitate_pose(expert, learner, jnp.asarray(poses), **options).qpos,),
+            np.asarray(qpos, np.float32),
+            size=_CHUNK,
+        )
+    return nearest

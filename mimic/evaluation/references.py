@@ -15,6 +15,7 @@ from mimic.envs.imitation import ImitationEnv
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 from mimic.retargeting import array_bound
+from mimic.retargeting.exact_chunks import by_chunks
 from mimic.retargeting.kinematic_bound import closest_motion
 from mimic.retargeting.pose import shared_joints
 from mimic.retargeting.pose_baselines import baseline_poses
@@ -76,14 +77,10 @@ def _lower_bound(env: ImitationEnv, qpos: Motions, qvel: Motions) -> tuple[np.nd
         return solution.distance, solution.qpos
 
     # Of many demonstrations in chunks of one size, the last one filled up: all at once, they need too much memory.
-    count = len(qpos)
-    size = min(count, _CHUNK)
-    padded = np.minimum(np.arange(-(-count // size) * size), count - 1).reshape(-1, size)
-    with on_host() if count <= _FEW else contextlib.nullcontext():
-        search = jax.jit(jax.vmap(closest))
-        chunks = [search(qpos[rows].astype(np.float32), qvel[rows].astype(np.float32)) for rows in padded]
-        distance, poses = (np.concatenate([np.asarray(chunk[i]) for chunk in chunks])[:count] for i in range(2))
-        return distance, poses
+    motions = qpos.astype(np.float32), qvel.astype(np.float32)
+    with on_host() if len(qpos) <= _FEW else contextlib.nullcontext():
+        distance, poses = by_chunks(jax.jit(jax.vmap(closest)), *motions, size=min(len(qpos), _CHUNK))
+    return distance, poses
 
 
 def references_of_arms(

@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # imports brax and MJX, which pose mappers do not need
 
 Table = dict[str, Float[np.ndarray, " demonstrations"]]
 WORST = 3  # number of the worst demonstrations of each split in a report
+_RESAMPLES = 2000  # of the bootstrap
 MIN_SPAN = 0.25  # of the distance of holding the start pose, that a best motion must save for a gap to mean something
 _ROUNDING = 1e-5  # float32 error of a torque at its limit (relative), or of a joint at the end of its range (rad)
 
@@ -160,8 +161,6 @@ def gap_interval(
     distance: Float[np.ndarray, "seeds demonstrations"],
     bound: Float[np.ndarray, " demonstrations"],
     hold: Float[np.ndarray, " demonstrations"],
-    *,
-    resamples: int = 2000,
 ) -> tuple[float, float, float]:
     """The optimality gap of mean distances, and its 95 % interval by a hierarchical bootstrap (percentiles).
 
@@ -171,15 +170,14 @@ def gap_interval(
       distance: mean distance of each demonstration with the policy of each seed.
       bound: its kinematic bound.
       hold: its distance of holding the start pose.
-      resamples: number of resamples.
 
     Returns:
       Gap, and the ends of the interval; NaN where there is no gap.
     """
     rng = np.random.default_rng(0)
     seeds, count = distance.shape
-    chosen_seeds = rng.integers(seeds, size=(resamples, seeds))
-    chosen = rng.integers(count, size=(resamples, count))
+    chosen_seeds = rng.integers(seeds, size=(_RESAMPLES, seeds))
+    chosen = rng.integers(count, size=(_RESAMPLES, count))
     # The number of times that each is drawn, in place of the drawn values: memory does not grow with their product.
     by_seed = (chosen_seeds[:, :, None] == np.arange(seeds)).mean(axis=1)
     by_demonstration = np.stack([np.bincount(row, minlength=count) for row in chosen]) / count

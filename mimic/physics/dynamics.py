@@ -89,10 +89,9 @@ def inverse(
     qvel: Sequence[Scalar],
     qacc: Sequence[Scalar],
     base: Vector | None = None,
-    trigonometry: Callable[[Scalar], PLANE] = cosine_and_sine,
 ) -> list[Scalar]:
     """Inverse dynamics: joint torques [N m] for joint accelerations [rad/s^2]; see `acceleration` for the arguments."""
-    turns = _turns(joints, qpos, base is None, trigonometry)
+    turns = _turns(joints, qpos, base is None, cosine_and_sine)
     totals = list(inertial_wrenches(joints, turns, qvel, qacc, base))
     torque: list[Scalar] = [0.0] * len(joints)
     for i in reversed(range(len(joints))):

@@ -34,9 +34,9 @@ def in_chunks(rows: np.ndarray, size: int, overlap: int = 0) -> Iterator[np.ndar
         yield np.concatenate([chunk, np.repeat(chunk[-1:], size - len(chunk), axis=0)])
 
 
-def by_chunks(function: Callable[..., Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-    """A function of chunks of rows, for all rows."""
-    chunks = zip(*(in_chunks(array, chunk_size()) for array in arrays), strict=True)
+def by_chunks(function: Callable[..., Any], *arrays: np.ndarray, size: int | None = None) -> tuple[np.ndarray, ...]:
+    """A function of chunks of rows, for all rows; `chunk_size` where no size is given."""
+    chunks = zip(*(in_chunks(array, size or chunk_size()) for array in arrays), strict=True)
     results = [function(*chunk) for chunk in chunks]
     return tuple(np.concatenate(jax.device_get(part))[: len(arrays[0])] for part in zip(*results, strict=True))
 

@@ -97,15 +97,15 @@ def _at_rest(model: mujoco.MjModel, arm: Arm) -> tuple[mujoco.MjData, np.ndarray
     return data, np.array([model.joint(name).qposadr[0] for name in arm.embodiment.joint_names])
 
 
-def touching_line(clearances: Float[np.ndarray, " motions"], noun: str = "demonstrations") -> str:
+def touching_line(clearances: Float[np.ndarray, " motions"]) -> str:
     """What `smallest_clearances` tell, as a sentence."""
     touching, smallest = np.flatnonzero(clearances < 0), f"{1e3 * clearances.min():.0f} mm"
     if not len(touching):
         return f"links touch neither each other nor the floor; smallest clearance: {smallest}"
     shown = ", ".join(map(str, touching[:_SHOWN])) + (", ..." if len(touching) > _SHOWN else "")
     return (
-        f"warning: links touch each other or the floor in {len(touching)} of {len(clearances)} {noun}: {shown}; "
-        f"smallest clearance: {smallest}"
+        f"warning: links touch each other or the floor in {len(touching)} of {len(clearances)} demonstrations: "
+        f"{shown}; smallest clearance: {smallest}"
     )
 
 

@@ -64,6 +64,8 @@ def read_bvh(path: Path) -> Bvh:
 
 def joint_positions(bvh: Bvh) -> np.ndarray:
     """Positions of the joints [frames, joints, 3], in the file's unit and axes."""
+    from scipy.spatial.transform import Rotation  # a tenth of a second to import
+
     frames = len(bvh.values)
     positions, rotations = [], []
     first = 0
@@ -73,7 +75,7 @@ def joint_positions(bvh: Bvh) -> np.ndarray:
             if quantity == "position":
                 local[:, axis] = column
             else:
-                rotation = rotation @ _rotations(axis, np.radians(column))
+                rotation = rotation @ Rotation.from_euler("xyz"[axis], column[:, None], degrees=True).as_matrix()
         first += len(joint.channels)
         if joint.parent < 0:
             positions.append(local)
@@ -91,17 +93,6 @@ def rest_positions(bvh: Bvh) -> np.ndarray:
     for joint in bvh.joints:
         positions.append(positions[joint.parent] + joint.offset if joint.parent >= 0 else np.zeros(3))
     return np.stack(positions)
-
-
-def _rotations(axis: int, angles: np.ndarray) -> np.ndarray:
-    """Rotation matrices [n, 3, 3] about a coordinate axis."""
-    rotation = np.zeros((len(angles), 3, 3))
-    second, third = (axis + 1) % 3, (axis + 2) % 3
-    rotation[:, axis, axis] = 1
-    rotation[:, second, second] = rotation[:, third, third] = np.cos(angles)
-    rotation[:, third, second] = np.sin(angles)
-    rotation[:, second, third] = -np.sin(angles)
-    return rotation
 
 
 def _hierarchy(text: str) -> tuple[Joint, ...]:
