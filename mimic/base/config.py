@@ -94,11 +94,16 @@ def explain(error: Exception) -> str:
         names = [str(name) for name in parent if name != "hydra"]
         return f"unknown key {str(key)!r}; valid are {', '.join(names)}{_suggested_key(str(key), parent)}"
     of_key = f"{key}: " if key else ""
-    if "DictConfig with ListConfig" in message or "is not a ListConfig" in message:
+    if null := re.fullmatch(r"field '(.*)' is not Optional|Incompatible value 'None' for field of type '\w+'", message):
+        return f"{null[1] or key}: expected a value, got null"
+    if "is not a ListConfig" in message:
+        return f"{of_key}expected a list, as in {key}=[VALUE]"
+    if "DictConfig with ListConfig" in message:
         return f"{of_key}expected a list where it is one, as in [VALUE], and else keys of its own"
     if wrong_type := re.fullmatch(r"(?:Invalid type|Merge).* is not a subclass of (\w+)\. value: (.*)", message):
-        expected = f"keys of its own, as in {key}.KEY=VALUE" if key else f"the fields of {wrong_type[1]}"
-        return f"{of_key}expected {expected}, got {wrong_type[2]!r:.80}"
+        fields = f"keys of its own, as in {key}.KEY=VALUE" if key else f"the fields of {wrong_type[1]}"
+        expected = {"str": "a text", "int": "an integer", "float": "a number"}.get(wrong_type[1], fields)
+        return f"{of_key}expected {expected}, got {'null' if wrong_type[2] == 'None' else repr(wrong_type[2])[:80]}"
     return message if str(key) in message else of_key + message
 
 

@@ -7,7 +7,7 @@ import copy
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from mimic.arms.drives import drives_of
 from mimic.arms.embodiment import Embodiment
 from mimic.base import compat, registry
 from mimic.envs.arm_state import ArmState, arm_state
-from mimic.envs.config import EnvConfig
+from mimic.envs.config import OBSERVATION_TERMS, EnvConfig
 from mimic.envs.start_poses import start_poses
 from mimic.envs.terms import ObservationTerm, Transition, observation_terms, observed, reward_terms
 from mimic.metric.capsule_distances import changing_pairs
@@ -365,7 +365,7 @@ class ImitationEnv(Env):
         """Length of an observation: numbers of each observed link and hand, and what terms or a subclass change."""
         if self._has_own_observation or self.observation_terms:
             return jax.eval_shape(lambda: self.observe(self.start(jax.random.PRNGKey(0)))).size
-        return observation_layout(self.expert, self.learner, self.config.preview)[-1]["stop"]
+        return observation_layout(self.expert, self.learner, self.config.preview, {})[-1]["stop"]
 
     @property
     def action_size(self) -> int:
@@ -437,8 +437,17 @@ def observed_parts(states: LinkStates) -> list[Array]:
     return [*parts, axes.reshape(*axes.shape[:-2], -1, 3, 3)[..., ::2, :]]
 
 
-def observation_layout(expert: Embodiment, learner: Embodiment, preview: int) -> list[dict[str, Any]]:
-    """The parts of an observation, in order: name, shape, unit, and the indices where they start and stop."""
+def observation_layout(
+    expert: Embodiment, learner: Embodiment, preview: int, terms: Mapping[str, int]
+) -> list[dict[str, Any]]:
+    """The parts of an observation, in order: name, shape, unit, and the indices where they start and stop.
+
+    Args:
+      expert: whose links are observed.
+      learner: whose links and joints are observed.
+      preview: see `EnvConfig`.
+      terms: length of each observation term by its name.
+    """
     observed = [("learner", learner), ("expert", expert)]
     observed += [(f"expert {ahead} steps ahead", expert) for ahead in range(1, preview + 1)]
     parts = []
@@ -450,12 +459,16 @@ def observation_layout(expert: Embodiment, learner: Embodiment, preview: int) ->
             parts.append((f"{arm_name}: hand x- and z-axes", [2 * len(arm.hand_joint), 3], "1"))
     of_joints = ("sines of the angles", "1"), ("cosines of the angles", "1"), ("joint velocities", "rad/s")
     parts += [(f"learner: {name}", [learner.num_joints], unit) for name, unit in of_joints]
+    for name, size in terms.items():
+        by = (("angles", "1/rad"), ("joint velocities", "s/rad")) if name in OBSERVATION_TERMS else ()
+        parts += [(f"{name}: by the learner's {values}", [size // 2], unit) for values, unit in by]
+        parts += [] if by else [(f"term: {name}", [size], "")]
     return _laid_out(parts)
 
 
-def _laid_out(parts: Sequence[tuple[str, list[int], str]], start: int = 0) -> list[dict[str, Any]]:
-    """Parts of names, shapes and units that follow each other from an index on, as in `observation_layout`."""
-    layout = []
+def _laid_out(parts: Sequence[tuple[str, list[int], str]]) -> list[dict[str, Any]]:
+    """Parts of names, shapes and units that follow each other, as in `observation_layout`."""
+    layout, start = [], 0
     for name, shape, unit in parts:
         stop = start + math.prod(shape)
         layout.append({"name": name, "shape": shape, "unit": unit, "start": start, "stop": stop})
@@ -464,16 +477,15 @@ def _laid_out(parts: Sequence[tuple[str, list[int], str]], start: int = 0) -> li
 
 
 def layout_of(env: ImitationEnv) -> list[dict[str, Any]]:
-    """The parts of an environment's observation, as in `observation_layout`, with those of terms or of its class."""
+    """The parts of an environment's observation, as in `observation_layout`, or the one part of its own class."""
     if env._has_own_observation:
         return _laid_out([(f"observation of {type(env).__name__}", [env.observation_size], "")])
-    layout = observation_layout(env.expert, env.learner, env.config.preview)
 
     def size(name: str, term: ObservationTerm) -> int:
         return jax.eval_shape(lambda: observed(name, term, env, env.start(jax.random.PRNGKey(0)))).size
 
-    parts = [(f"term: {name}", [size(name, term)], "") for name, term in env.observation_terms]
-    return layout + _laid_out(parts, layout[-1]["stop"])
+    terms = {name: size(name, term) for name, term in env.observation_terms}
+    return observation_layout(env.expert, env.learner, env.config.preview, terms)
 
 
 def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple[Demonstrations, Demonstrations]:

@@ -107,7 +107,8 @@ def gradient_by_learner(
 ) -> Float[Array, " 2*joints"]:
     """Gradient of the distance to states of the expert, by the learner's angles [1/rad], then its speeds [s/rad].
 
-    In closed form where `motion_distance` has one, else by automatic differentiation.
+    In closed form where `motion_distance` has one, else by automatic differentiation; 0 where that is not finite, as of
+    the norm of two positions that match.
 
     Args:
       metric: between the two arms.
@@ -127,7 +128,8 @@ def gradient_by_learner(
     def distance(qpos: Array, qvel: Array) -> Array:
         return metric(expert_states, link_states(learner, qpos, qvel))
 
-    return jnp.concatenate(jax.grad(distance, argnums=(0, 1))(qpos, qvel))
+    gradient = jnp.concatenate(jax.grad(distance, argnums=(0, 1))(qpos, qvel))
+    return jnp.where(jnp.isfinite(gradient), gradient, 0)
 
 
 def _is_constant(tree: Any) -> bool:

@@ -19,6 +19,9 @@ from tests.helpers.repository import REPOSITORY
     [
         (["env.world.payload=[0,1]"], "env.world.payload: expected with an inner loop, as in world=ideal"),
         (["env.observation=[twist]"], "env.observation: expected a list where it is one, as in [VALUE], and else keys"),
+        (["env.observation.terms=x"], "env.observation.terms: expected a list, as in env.observation.terms=[VALUE]\n"),
+        (["env.observation.terms=[null]"], "env.observation.terms[0]: expected a text, got null\n"),
+        (["env.horizon=null"], "env.horizon: expected a value, got null\n"),
         (["seed=one"], "could not be converted to Integer"),
         (["+foo=1"], "foo"),
         (["trainer=pose_mapper", "trainer.num_envs=8"], "unknown key 'trainer.num_envs'; valid are name, preset"),
@@ -75,7 +78,7 @@ def test_choices_suggest_the_closest_name(reason):
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (None, "not a run directory"),
+        (None, "run: expected a run directory"),
         ("trainer: {name: ppo, previw: 1}\n", "previw"),
         ("trainer: {name: ppo}\n", "no checkpoint"),
     ],

@@ -186,7 +186,7 @@ def test_a_mapper_of_other_arms_or_of_no_run_is_rejected(trained, tmp_path):
     mapper.check_fits(mapper.expert, mapper.learner)
     with pytest.raises(ValueError, match="its learner is planar2"):
         mapper.check_fits(mapper.expert, mimic.panda())
-    with pytest.raises(ValueError, match="not a run directory"):
+    with pytest.raises(ValueError, match="run_dir: expected a run directory"):
         mimic.PoseMapper.load(tmp_path)
     (tmp_path / "config.yaml").write_text("trainer: {name: ppo}\n")
     with pytest.raises(ValueError, match="expected a run of trainer=pose_mapper, got one of ppo"):

@@ -144,8 +144,8 @@ def _policy_sizes(config: TrainConfig) -> tuple[int, int]:
     from mimic.envs.imitation import observation_layout
 
     expert, learner = map(config.env.metric.compared, config.env.build_arms().embodiments)
-    of_terms = 2 * learner.num_joints * len(config.env.observed_terms)  # the distance's gradient, or nothing
-    return observation_layout(expert, learner, config.env.preview)[-1]["stop"] + of_terms, learner.num_joints
+    terms = dict.fromkeys(config.env.observed_terms, 2 * learner.num_joints)  # the built-in one
+    return observation_layout(expert, learner, config.env.preview, terms)[-1]["stop"], learner.num_joints
 
 
 def _policy(folder: Path, config: TrainConfig) -> Function:

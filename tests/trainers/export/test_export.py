@@ -92,7 +92,9 @@ def test_the_metadata_describes_inputs_and_outputs(policy):
             part = layout[f"{whose}: {name}"]
             observed = state.obs[part["start"] : part["stop"]].reshape(part["shape"])
             np.testing.assert_allclose(observed, values, atol=1e-6)
-    assert max(part["stop"] for part in layout.values()) == env.observation_size
+    gradient = [layout[f"distance_gradient: by the learner's {name}"] for name in ("angles", "joint velocities")]
+    assert [(part["shape"], part["unit"]) for part in gradient] == [([4], "1/rad"), ([4], "s/rad")]
+    assert gradient[1]["stop"] == max(part["stop"] for part in layout.values()) == env.observation_size
 
 
 OTHER_METRIC = {"translation": 1.0, "correspondence": "soft", "rotation_measure": "angle", "reduction": "frobenius"}

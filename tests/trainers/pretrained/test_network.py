@@ -13,7 +13,7 @@ from mimic.evaluation.evaluator import Evaluator
 from mimic.runs.files import REPORT
 from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
 from mimic.trainers.pretrained.files import PARAMETERS, read_params, write_network
-from mimic.trainers.pretrained.network import NETWORKS, TRAINERS, pretrained_names, read_network
+from mimic.trainers.pretrained.network import NETWORKS, TRAINERS, policy_template, pretrained_names, read_network
 
 MAX_BYTES = 5_000_000  # of all of them: the package stays small
 OBSERVATION = 254  # numbers that the policy of planar4dof observes
@@ -79,6 +79,14 @@ def test_a_batch_is_the_same_as_its_samples():
         assert outputs.shape == (5, 4)
         np.testing.assert_allclose(outputs[2], jax.jit(network)(inputs[2]), atol=1e-5)  # float32 matrix products
     assert np.abs(outputs).max() <= 1
+
+
+@pytest.mark.parametrize("terms", [None, []])
+def test_a_policy_reads_what_its_environment_observes(terms):
+    changes = {"observation": {"terms": terms}, "demonstrations": {"count": 2, "held_out": 1}}
+    env = mimic.make("planar4dof", **changes)
+    statistics, _ = policy_template(dataclasses.replace(mimic.load("planar4dof").config, env=env.config))
+    assert statistics.mean.shape == (env.observation_size,) == (OBSERVATION + (8 if terms is None else 0),)
 
 
 def test_inputs_of_another_size_are_reported():
