@@ -275,12 +275,12 @@ def _register_schemas() -> None:
 
 
 def _one_line(error: BaseException) -> str:
-    """The innermost cause of an error, as one line with the valid choices."""
+    """An error as one line with the valid choices; of OmegaConf's and Hydra's errors the innermost cause."""
     causes = [error]
     while causes[-1].__cause__ is not None:
         causes.append(causes[-1].__cause__)
     typed_errors = [cause for cause in causes if isinstance(cause, OmegaConfBaseException)]
-    if typed_errors:
+    if typed_errors and isinstance(error, _CONFIG_ERRORS):
         return explain(typed_errors[-1])
     if isinstance(error, FrozenInstanceError):
         return f"unknown keys cannot be added: {error}"

@@ -79,14 +79,14 @@ def test_choices_suggest_the_closest_name(reason):
     ("config", "message"),
     [
         (None, "run: expected a run directory"),
-        ("trainer: {name: ppo, previw: 1}\n", "previw"),
+        ("trainer: {name: ppo, previw: 1}\n", "config.yaml' cannot be read: unknown key 'trainer.previw'"),
         ("trainer: {name: ppo}\n", "no checkpoint"),
     ],
 )
-def test_unreadable_run_directories(reason, tmp_path, config, message):
+def test_unreadable_run_directories(rejected, tmp_path, config, message):
     if config is not None:
         (tmp_path / "config.yaml").write_text(config)
-    assert message in reason("evaluate", f"run={tmp_path}")
+    assert message in rejected("evaluate", f"run={tmp_path}")
 
 
 def test_hydra_completes_keys_and_choices(monkeypatch, capsys):
