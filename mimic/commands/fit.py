@@ -83,10 +83,10 @@ class Run:
 
     def make_env(self) -> ImitationEnv:
         """The environment of the run, with its training demonstrations; an `AnyArmEnv` for a run of many arms."""
-        env, path = self.config.env, self.run_dir / DEMONSTRATIONS
-        if path.is_file():
-            env = dataclasses.replace(env, demonstrations=dataclasses.replace(env.demonstrations, path=str(path)))
-        return make_env(env)
+        from mimic.trainers.ppo.trainer import with_saved_demonstrations  # takes seconds to import
+
+        has_own = (self.run_dir / DEMONSTRATIONS).is_file()
+        return make_env(with_saved_demonstrations(self.config.env, self.run_dir if has_own else None))
 
     def evaluate(self, *, quiet: bool = False, **options: Any) -> dict[str, Any]:
         """Evaluates the run, as `python -m mimic.evaluate` does.

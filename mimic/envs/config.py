@@ -48,6 +48,10 @@ class DemonstrationConfig:
 
     def __post_init__(self) -> None:
         check_choice("kind", self.kind, (*KINDS, MIXED))
+        if self.path and self.source:
+            raise ValueError("demonstrations: expected path or source, got both")
+        if (self.path or self.source) and self.kind != MIXED:
+            raise ValueError(f"demonstrations.kind: expected none with a path or source, got {self.kind}")
         check_ranges(self, "demonstrations.")
 
 

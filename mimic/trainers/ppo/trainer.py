@@ -18,6 +18,7 @@ from mimic.envs.make import make_env
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory, nearest_pose_controller
 from mimic.motions.demonstrations import Demonstrations, check_effort, concatenate, crossovers
+from mimic.motions.experts import MIXED
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
@@ -287,7 +288,7 @@ def with_saved_demonstrations(config: EnvConfig, run_dir: Path | None) -> EnvCon
     """The environment with the demonstrations of an existing run, if there is one."""
     if run_dir is None:
         return config
-    saved = dataclasses.replace(config.demonstrations, path=str(run_dir / DEMONSTRATIONS))
+    saved = dataclasses.replace(config.demonstrations, path=str(run_dir / DEMONSTRATIONS), source="", kind=MIXED)
     return dataclasses.replace(config, demonstrations=saved)
 
 
