@@ -158,8 +158,9 @@ def _load_mapper(config: ViewConfig) -> "PoseMapper":
     from mimic.trainers.pretrained.network import NETWORKS, pretrained_names, read_network
 
     run_dir = Path(config.mapper).expanduser()
-    if config.mapper not in pretrained_names("pose_mapper") or run_dir.exists():
-        check_run_dir(run_dir, "mapper")
+    names = pretrained_names("pose_mapper")
+    if config.mapper not in names or run_dir.exists():
+        check_run_dir(run_dir, "mapper", f" or one of {', '.join(names)},")
         return PoseMapper.load(run_dir, config.checkpoint)
     if config.checkpoint is not None:
         raise ValueError(f"checkpoint: expected none with mapper={config.mapper}, which comes with mimic")

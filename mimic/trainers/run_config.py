@@ -3,6 +3,8 @@
 import dataclasses
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ from mimic.base.config_files import check_references, read_config
 from mimic.base.files import write_atomically
 from mimic.base.overrides import setting, shell_words
 from mimic.envs.config import ObservationConfig
-from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
+from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, DEMONSTRATIONS
 from mimic.runs.lock import LOCK
 from mimic.runs.parameters import OtherParameters
@@ -78,10 +80,10 @@ def run_schema(trainer: str) -> DictConfig:
     return merged(schema(TrainConfig), {"trainer": schema(trainer_config(trainer))})
 
 
-def check_run_dir(run_dir: Path, key: str) -> None:
-    """Raises a ValueError that names the key unless a path is that of a run directory."""
+def check_run_dir(run_dir: Path, key: str, choices: str = "") -> None:
+    """Raises a ValueError with the key and the other choices unless a path is that of a run directory."""
     if not (run_dir / CONFIG).is_file():
-        raise ValueError(f"{key}: expected a run directory, which has a {CONFIG}, got {str(run_dir)!r}")
+        raise ValueError(f"{key}: expected a run directory, which has a {CONFIG},{choices} got {str(run_dir)!r}")
 
 
 def load_config(run_dir: Path, key: str = "run_dir", *, saved_models: bool = True) -> TrainConfig:
@@ -132,28 +134,29 @@ def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:
     return run_dir, trained
 
 
-def initial_params(config: TrainConfig, template: Any) -> Any:
-    """The parameters that a new run starts from: those of the last checkpoint of `init`.
+@contextmanager
+def errors_of_networks(config: TrainConfig, run_dir: Path, key: str) -> Iterator[None]:
+    """Context in which the line of an error says by which settings a checkpoint is that of other networks.
 
     Args:
-      config: resolved config of the new run.
-      template: see `load_checkpoint`.
+      config: resolved config that the checkpoint should fit.
+      run_dir: run directory of the checkpoint.
+      key: see `load_config`.
 
     Raises:
-      ValueError: `init` is no run directory, or a run whose networks have other inputs, outputs or layers.
+      ValueError: see `load_config`; or the checkpoint's networks have other inputs, outputs or layers.
     """
-    run_dir = Path(config.init).expanduser()
-    given = load_config(run_dir, "init")
+    given = load_config(run_dir, key)
     try:
-        return load_checkpoint(run_dir, template)[1]
+        yield
     except OtherParameters as error:
         new, old = _of_networks(config), _of_networks(given)
-        keys = [key for key in new | old if new.get(key) != old.get(key)]
+        keys = [name for name in new | old if new.get(name) != old.get(name)]
         if not keys:
             raise
         keys = ["trainer.name"] if "trainer.name" in keys else keys
-        expected, got = (", ".join(setting(key, values.get(key)) for key in keys) for values in (new, old))
-        raise ValueError(f"init: expected a run of {expected}, got one of {got}") from error
+        expected, got = (", ".join(setting(name, values.get(name)) for name in keys) for values in (new, old))
+        raise ValueError(f"{key}: expected a run of {expected}, got one of {got}") from error
 
 
 def _of_networks(config: TrainConfig) -> dict[str, Any]:

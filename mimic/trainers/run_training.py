@@ -19,6 +19,7 @@ from mimic.runs.checkpoints import (
     checkpoint_steps,
     delete_checkpoint,
     delete_partial_checkpoints,
+    load_checkpoint,
     load_training,
     mark_damaged_after,
 )
@@ -38,8 +39,8 @@ from mimic.trainers.progress import TrainingProgress
 from mimic.trainers.report import make_report, show_report
 from mimic.trainers.run_config import (
     check_new_run,
+    errors_of_networks,
     how_to_continue,
-    initial_params,
     is_brax,
     load_config,
     new_run_dir,
@@ -141,12 +142,15 @@ def _start(config: TrainConfig, resumed_dir: Path | None, trainer: Trainer, is_c
       trainer: trainer of the run.
       is_changed: whether settings of the resumed run are changed.
     """
+    resolved = dataclasses.replace(config, env=trainer.env_config, trainer=trainer.settings)
     if not resumed_dir or not checkpoint_steps(resumed_dir):  # new, or ended before its first checkpoint
         if not config.init:
             return None
-        resolved = dataclasses.replace(config, env=trainer.env_config, trainer=trainer.settings)
-        return Checkpoint(0, initial_params(resolved, trainer.params_template()), None, {})
-    restored = load_training(resumed_dir, trainer.params_template())
+        init = Path(config.init).expanduser()
+        with errors_of_networks(resolved, init, "init"):
+            return Checkpoint(0, load_checkpoint(init, trainer.params_template())[1], None, {})
+    with errors_of_networks(resolved, resumed_dir, "resume"):
+        restored = load_training(resumed_dir, trainer.params_template())
     if jax.default_backend() == "gpu" and not config.compilation_cache:
         print(
             "warning: without a compilation cache, XLA may choose other matrix products than before: the numbers may "

@@ -24,7 +24,7 @@ from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer
 from mimic.trainers.ppo import ppo
 from mimic.trainers.ppo.trainer import PPOTrainer
-from mimic.trainers.run_config import initial_params, save_config
+from mimic.trainers.run_config import save_config
 from tests.helpers.untrained_run import COUNT, HELD_OUT, HORIZON, environment, untrained_run
 
 
@@ -171,8 +171,18 @@ def test_a_run_does_not_start_from_networks_of_other_settings(reason, run_dir, t
     expected, got = line.removeprefix("init: expected a run of ").split(", got one of ")
     assert "env.observation.terms=[]" in expected and "env.observation.terms=[distance_gradient]" in got
     assert "env.expert.link_lengths=[0.5,0.4]" in expected and "learner" not in line and "hidden" not in line
-    with pytest.raises(ValueError, match="^init: expected a run directory, which has a config.yaml, got 'no'$"):
-        initial_params(TrainConfig(init="no"), None)
+
+
+def test_a_run_is_not_resumed_with_other_layers(reason, run_dir):
+    line = reason("train", f"resume={run_dir}", "trainer.hidden_layers=[7]", "compilation_cache=")
+    assert line == "resume: expected a run of trainer.hidden_layers=[7], got one of trainer.hidden_layers=[8]"
+
+
+@pytest.mark.parametrize("key", ["init", "resume"])
+def test_a_training_names_the_key_of_what_is_no_run(reason, key):
+    few = "env.demonstrations.count=1", "env.demonstrations.held_out=1"
+    line = reason("train", "env=planar4dof", f"{key}=absent", *few)
+    assert line == f"{key}: expected a run directory, which has a config.yaml, got 'absent'"
 
 
 def test_a_run_of_braxs_loop_is_not_resumed(reason, tmp_path):

@@ -30,7 +30,7 @@ from tests.helpers.bodies import bvh_text, person
     [
         (["host=nowhere.invalid"], "host: expected an address of this machine"),
         (["learner=missing.xml"], "no MJCF or URDF file at"),
-        (["mapper=missing"], "mapper: expected a run directory, which has a config.yaml, got 'missing'"),
+        (["mapper=missing"], "mapper: expected a run directory, which has a config.yaml, or one of panda3dof, "),
         (["run=a", "mapper=b"], "expected one of them"),
         (["mapper=planar4dof", "expert=panda"], "expert: expected none with mapper=, which brings its own"),
         (["run=a", "learner=panda"], "learner: expected none with run=, which brings its own"),

@@ -176,7 +176,7 @@ def test_a_run_starts_from_the_parameters_of_another_run(finished, tmp_path):
     with np.load(run_dir / "checkpoints" / f"{0:012d}" / "training.npz") as file:
         np.testing.assert_array_equal(file["arr_0"], policy)
     other = command("train", "env=panda3dof", f"init={finished[0]}", f"run_dir={tmp_path / 'other'}")
-    assert other.returncode == 2 and "another network" in other.stderr
+    assert other.returncode == 2 and "init: expected a run of env.expert.model=panda" in other.stderr
 
 
 @pytest.mark.slow
