@@ -20,7 +20,7 @@ from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.make import make_ppo_trainer, make_trainer
 from mimic.trainers.report import make_report, show_report
-from mimic.trainers.run_config import load_config, save_config
+from mimic.trainers.run_config import given_run, save_config
 from mimic.trainers.trainer import Trainer
 
 CONTROLLERS_OF_MANY = ("policy", "nearest_pose")
@@ -53,26 +53,16 @@ def _robot_evaluation(config: EvaluateConfig) -> Callable[[], None]:
     from mimic.commands.evaluate_robot import prepare_robot_evaluation  # brax and MJX, which take seconds to import
 
     use_compilation_cache(config.compilation_cache)
-    run_dir, trained = _run_to_evaluate(config)
+    run_dir, trained = given_run(config.run)
     trained, trainer = _trainer_to_evaluate(trained, run_dir, config)
     return prepare_robot_evaluation(config, trained, trainer, run_dir)
-
-
-def _run_to_evaluate(config: EvaluateConfig) -> tuple[Path, TrainConfig]:
-    """The run directory and its config."""
-    if not config.run:
-        raise ValueError("run: expected the run directory to evaluate, as in run=runs/NAME")
-    run_dir = Path(config.run).expanduser()
-    trained = load_config(run_dir, "run")  # saved with all values resolved, so that they do not depend on this machine
-    check_checkpoint(run_dir, config.checkpoint)
-    return run_dir, trained
 
 
 def prepare_report(config: EvaluateConfig, started: float, console: Console) -> Callable[[], dict[str, Any]]:
     """The same as `prepare_evaluation`, as a function that returns the report."""
     stopwatch = Stopwatch(started)
     use_compilation_cache(config.compilation_cache)
-    run_dir, trained = _run_to_evaluate(config)
+    run_dir, trained = given_run(config.run)
     out = new_folder("out", config.out) if config.out else None
     with stopwatch.stage("build"):
         trained, trainer = _trainer_to_evaluate(trained, run_dir, config)
@@ -100,6 +90,7 @@ def prepare_report(config: EvaluateConfig, started: float, console: Console) -> 
 
 def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Trainer]:
     """The trainer of a run, with the demonstrations, the physics and the arm parameters of the evaluation."""
+    check_checkpoint(run_dir, config.checkpoint)
     factors = {"mass": config.mass, "damping": config.damping}
     changes = {key: [value, value] for key, value in factors.items() if value is not None}
     if trained.trainer.name != "ppo":

@@ -118,16 +118,17 @@ def _read_config(run_dir: Path) -> TrainConfig:
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error
 
 
-def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:
-    """The directory and the config of a run, for a command that shows its policy.
-
-    Raises:
-      ValueError: no run directory, a run of another trainer than PPO, or no such checkpoint.
-    """
+def given_run(run: str) -> tuple[Path, TrainConfig]:
+    """The directory and the config of the run of a command. Raises a ValueError for no run directory."""
     if not run:
-        raise ValueError("run: expected the run directory to show, as in run=runs/NAME")
+        raise ValueError("run: expected a run directory, as in run=runs/NAME")
     run_dir = Path(run).expanduser()
-    trained = load_config(run_dir, "run")
+    return run_dir, load_config(run_dir, "run")
+
+
+def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:
+    """The directory and the config of a run of PPO. Raises a ValueError for any other, or no such checkpoint."""
+    run_dir, trained = given_run(run)
     if trained.trainer.name != "ppo":
         raise ValueError(f"run: expected a run of trainer=ppo, got one of {trained.trainer.name}")
     check_checkpoint(run_dir, checkpoint)

@@ -169,7 +169,7 @@ def test_motions_of_an_expert_from_a_file(tmp_path, side):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "run: expected the run directory"),
+        ([], "run: expected a run directory"),
         (["run=missing", "split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )

@@ -11,12 +11,11 @@ from rich.console import Console
 from mimic.base.config import check_choice, new_file, new_folder
 from mimic.base.distribution import import_extra
 from mimic.runs.checkpoints import check_checkpoint
-from mimic.trainers.config import TrainConfig
 from mimic.trainers.export.config import CONTROLLER, EXPORT_FORMATS, ExportConfig
 from mimic.trainers.export.export_controller import prepare_controller
 from mimic.trainers.export.functions import ExportedFunction, make_function
 from mimic.trainers.export.onnx_model import to_onnx
-from mimic.trainers.run_config import load_config
+from mimic.trainers.run_config import given_run
 
 _PACKAGES = ("jax2onnx", "onnxruntime")
 
@@ -77,7 +76,7 @@ def _writer(config: ExportConfig) -> tuple[Callable[[], None], str]:
     if config.format == CONTROLLER:
         _check_packages(config.format)
         out = new_folder("out", config.out)
-        write = prepare_controller(_run_dir(config), config.checkpoint)
+        write = prepare_controller(given_run(config.run)[0], config.checkpoint)
         return lambda: write(out), ""
     out = new_file("out", config.out)
     if not os.access(out.parent, os.W_OK):
@@ -90,21 +89,15 @@ def _writer(config: ExportConfig) -> tuple[Callable[[], None], str]:
     return lambda: _write(exported, out), summary
 
 
-def _run_dir(config: ExportConfig) -> Path:
-    if not config.run:
-        raise ValueError("run: expected the run directory to export, as in run=runs/NAME")
-    return Path(config.run).expanduser()
-
-
 def _check_packages(format: str) -> None:
     """Raises a `ValueError` where a package that writes a format is not installed."""
     for package in _PACKAGES:
         import_extra(package, "export", f"format={format}")
 
 
-def _exportable(config: ExportConfig) -> TrainConfig:
-    """The config of the run. Raises a `ValueError` for a policy with an inner loop, or of many arms."""
-    trained = load_config(_run_dir(config), "run")
+def exported_function(config: ExportConfig) -> ExportedFunction:
+    """The function of a run's network. Raises a `ValueError` for a policy with an inner loop, or of many arms."""
+    run_dir, trained = given_run(config.run)
     if trained.trainer.name == "ppo" and trained.env.kind == "inner_loop":
         raise ValueError(f"format: expected {CONTROLLER} for a run with an inner loop, got {config.format}")
     if trained.trainer.name == "ppo" and trained.env.kind == "sampled_arms":
@@ -112,14 +105,7 @@ def _exportable(config: ExportConfig) -> TrainConfig:
             f"run: expected a policy of one arm, or a pose mapper, got a policy of many arms, env={trained.env.name}; "
             "train one for your arm with env=pair env.learner=ARM"
         )
-    return trained
-
-
-def exported_function(config: ExportConfig) -> ExportedFunction:
-    """The function of a run's network."""
-    run_dir, trained = _run_dir(config), _exportable(config)
-    steps = check_checkpoint(run_dir, config.checkpoint)
-    return make_function(trained, run_dir, steps)
+    return make_function(trained, run_dir, check_checkpoint(run_dir, config.checkpoint))
 
 
 def _write(exported: ExportedFunction, out: Path) -> None:

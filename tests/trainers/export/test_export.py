@@ -141,7 +141,7 @@ def mapped(tmp_path_factory):
     ("arguments", "message"),
     [
         ([], "out: expected a file"),
-        (["out=new.onnx", "run="], "run: expected the run directory to export"),
+        (["out=new.onnx", "run="], "run: expected a run directory, as in run=runs/NAME"),
         (["out=new.onnx", "run=missing"], "run: expected a run directory, which has a config.yaml, got 'missing'"),
         ([f"out={__file__}"], "exists; name a new file"),
         (["out=no/new.onnx"], "there is no folder 'no'"),
