@@ -9,6 +9,8 @@ from jaxtyping import Float
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.base.compilation import on_host
+from mimic.control import clearance
+from mimic.metric.capsule_distances import clearance_constants, colliding_pairs
 from mimic.retargeting.costs import Costs
 from mimic.retargeting.exact_chunks import by_chunks
 from mimic.retargeting.pose import imitate_pose
@@ -18,8 +20,9 @@ _AT_HOME = 1e-4  # rad
 # adds 0.1 % to the mean distance of a Panda from a captured arm.
 _HOME = 0.01
 _SELF_COLLISION, CLEARANCE = 10.0, 0.05  # weight, and m
-_STARTS = 48  # random initial guesses: with 12 the poses are 0.4 % farther, and others from one window to the next
-_CHUNK = 256  # poses at a time: one function is compiled for any number of demonstrations
+# Poses at a time, so that one function is compiled for any number of demonstrations; random initial guesses. With 12
+# guesses the poses are 0.4 % farther, and others from one window to the next.
+_WITHOUT, _WITH_CAPSULES = (256, 48), (64, 12)
 
 
 def start_poses(
@@ -41,7 +44,13 @@ def start_poses(
     poses = np.tile(np.asarray(learner.home, np.float32), (len(qpos), 1))
     elsewhere = ~np.isclose(qpos, np.asarray(expert.home), rtol=0, atol=_AT_HOME).all(axis=1)
     if elsewhere.any():
-        poses[elsewhere] = _nearest_poses(expert, learner, qpos[elsewhere], metric, capsules)
+        poses[elsewhere] = _nearest_poses(expert, learner, qpos[elsewhere], metric)
+    if capsules is not None:  # again where links come near each other: a pose then takes 100 times as long
+        constants = clearance_constants(learner, capsules, pairs=colliding_pairs(learner, capsules))
+        distances = clearance.pair_distances(*clearance.capsule_axes(poses, constants), constants)
+        near = elsewhere & (distances < 0.8 * CLEARANCE).any(axis=1)
+        if near.any():
+            poses[near] = _nearest_poses(expert, learner, qpos[near], metric, capsules)
     return poses
 
 
@@ -50,15 +59,16 @@ def _nearest_poses(
     learner: Embodiment,
     qpos: Float[np.ndarray, "poses expert_joints"],
     metric: dict[str, Any],
-    capsules: Capsules | None,
+    capsules: Capsules | None = None,
 ) -> Float[np.ndarray, "poses joints"]:
     """The poses nearest to the expert's, see `imitate_pose`."""
+    size, starts = _WITH_CAPSULES if capsules else _WITHOUT
     costs = Costs(home=_HOME, self_collision=_SELF_COLLISION if capsules else 0.0, clearance=CLEARANCE)
-    options = {"starts": _STARTS, "costs": costs, "capsules": capsules, **metric}
+    options = {"starts": starts, "costs": costs, "capsules": capsules, **metric}
     with on_host():  # compiles several times faster, and runs once
         (nearest,) = by_chunks(
             lambda poses: (imitate_pose(expert, learner, jnp.asarray(poses), **options).qpos,),
             np.asarray(qpos, np.float32),
-            size=_CHUNK,
+            size=size,
         )
     return nearest
