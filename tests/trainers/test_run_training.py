@@ -256,6 +256,7 @@ def test_a_training_that_diverges_stops_and_keeps_its_checkpoints(finished, tmp_
     """It starts from a policy whose actions are beyond float32, although its parameters are not."""
     start, run_dir = tmp_path / "start", tmp_path / "run"
     start.mkdir()
+    shutil.copy(finished[0] / "config.yaml", start)
     template = make_ppo_trainer(load_config(finished[0]), finished[0]).params_template()
     step, (statistics, policy, value) = load_checkpoint(finished[0], template)
     save_checkpoint(start, step, (statistics, jax.tree.map(lambda x: 1e30 * x, policy), value))
