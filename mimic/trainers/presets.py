@@ -21,7 +21,7 @@ PPO_PRESETS: dict[str, dict[str, Any]] = {
         "network": "mlp",
         "hidden_layers": [128, 128],
         "crossovers": 4000,
-        "displaced_crossovers": 0.2,
+        "displaced_crossovers": 0.1,
         "evaluations": 10,
     },
     # One GPU: enough environments to keep it busy. The high entropy cost makes the arm explore other pose branches.
