@@ -21,7 +21,6 @@ from mimic.base.spatial import ZERO, Scalar, Vector, add, cross, dot, plus, scal
 from mimic.metric.distance import PARTS
 from mimic.metric.kinematics import (
     JointFrame,
-    LinkStates,
     LinkVectors,
     hand_vectors,
     joint_frames,
@@ -81,31 +80,27 @@ def distance_and_gradient(
 def gradient_by_learner(
     learner: Embodiment,
     factors: Float[np.ndarray, "parts rows learner_rows"],
-    expert_states: LinkStates,
+    expert: Sequence[Scalar],
     qpos: Sequence[Scalar],
     qvel: Sequence[Scalar],
-) -> tuple[list[Scalar], list[Scalar]]:
-    """Gradients of the distance to states of an expert by the learner's qpos and qvel.
+) -> list[list[Scalar]]:
+    """The gradient of the distance to states of an expert by the learner's qpos, then by its qvel.
 
     Args:
       learner: in units of its chain length.
       factors: see `distance_and_gradient`.
-      expert_states: normalized, with directions and hands.
+      expert: normalized states of the expert's rows, one after the other: the components of `LinkVectors`.
       qpos: of the learner [rad].
       qvel: likewise [rad/s].
     """
     frames = joint_frames(learner, qpos, qvel)
     links = link_vectors(learner, frames)
-    seen, hand = expert_states, expert_states.hand
-    assert seen.direction is not None and seen.angular_velocity is not None
-    parts = zip(seen.position, seen.direction, seen.linear_velocity, seen.angular_velocity, strict=True)
-    expert = [LinkVectors(*map(spatial.vector, link)) for link in parts]
-    if hand is not None and factors.shape[1] > len(expert):  # a row for each axis of a hand too
+    vectors = [(expert[k], expert[k + 1], expert[k + 2]) for k in range(0, len(expert), 3)]
+    rows = [LinkVectors(*vectors[k : k + 4]) for k in range(0, len(vectors), 4)]
+    if factors.shape[2] > len(links):  # a row for each axis of a hand too
         links += hand_vectors(learner, frames)
-        for row, axis in enumerate(hand.axes):
-            position, velocity = (spatial.vector(x[row // 3]) for x in (hand.position, hand.angular_velocity))
-            expert.append(LinkVectors(position, spatial.vector(axis), ZERO, velocity))
-    return _by_joints(learner, frames, links, _compare(factors, expert, links)[1][1])
+    by_qpos, by_qvel = _by_joints(learner, frames, links, _compare(factors, rows, links)[1][1])
+    return [by_qpos + by_qvel]
 
 
 def _compare(

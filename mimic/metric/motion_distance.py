@@ -122,14 +122,27 @@ def gradient_by_learner(
         hands = 0 if expert_states.hand is None else len(expert_states.hand.position)
         factors = np.asarray(metric.factors(hands, len(learner.hand_joint)), float)
         arm = in_chain_lengths(_as_numpy(learner))
-        gradients = analytic_gradient.gradient_by_learner(arm, factors, expert_states, list(qpos), list(qvel))
-        return jnp.stack([jnp.asarray(x, qpos.dtype) for of_part in gradients for x in of_part])
+        function = functools.partial(analytic_gradient.gradient_by_learner, arm, factors)
+        of_rows = fused_kernel.fused(function, [2 * arm.num_joints])
+        return of_rows(_rows(expert_states, factors.shape[1]), qpos, qvel)[0]
 
     def distance(qpos: Array, qvel: Array) -> Array:
         return metric(expert_states, link_states(learner, qpos, qvel))
 
     gradient = jnp.concatenate(jax.grad(distance, argnums=(0, 1))(qpos, qvel))
     return jnp.where(jnp.isfinite(gradient), gradient, 0)
+
+
+def _rows(states: LinkStates, count: int) -> Float[Array, " components"]:
+    """The components of `LinkVectors` of each link and, where there are more rows than links, of each hand's axes."""
+    parts = states.position, states.direction, states.linear_velocity, states.angular_velocity
+    rows = jnp.stack([jnp.asarray(part) for part in parts], axis=1)
+    hand = states.hand
+    if hand is not None and count > len(rows):
+        position, velocity = (jnp.repeat(x, 3, axis=0) for x in (hand.position, hand.angular_velocity))
+        of_hands = position, hand.axes, jnp.zeros_like(position), velocity
+        rows = jnp.concatenate([rows, jnp.stack(of_hands, axis=1)])
+    return rows.ravel()
 
 
 def _is_constant(tree: Any) -> bool:
