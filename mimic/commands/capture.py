@@ -92,13 +92,14 @@ def read_arm(source: Path, side: str, config: CaptureConfig, fixed: float = 0.0)
     return Capture(body, [_with_lengths(part, lengths) for part in parts], starts, bridged)
 
 
-def read_body(source: Path, config: CaptureConfig, side: str = "") -> PointMotion:
-    """Reads all points of a file; for the points that the config names see `read_motion`.
+def read_body(source: Path, config: CaptureConfig, side: str = "", key: str = "source") -> PointMotion:
+    """Reads all points of a file; for the points that the config names and `key` see `read_motion`.
 
     Raises:
       ValueError: what `read_motion` rejects, or points that are named for both arms.
     """
-    return read_motion(source, unit=config.unit, up=config.up, subject=config.subject, arm=named_arm(config, side))
+    arm = named_arm(config, side)
+    return read_motion(source, unit=config.unit, up=config.up, subject=config.subject, arm=arm, key=key)
 
 
 def named_arm(config: CaptureConfig, side: str) -> ArmPoints | None:
@@ -191,10 +192,7 @@ def prepare_capture_inspection(source: Path, config: CaptureConfig) -> Callable[
     Raises:
       ValueError: what `read_motion` rejects.
     """
-    try:
-        body = read_body(source, config)
-    except ValueError as error:
-        raise ValueError(str(error).replace("source:", "clip:", 1)) from error
+    body = read_body(source, config, key="clip")
 
     def run() -> None:
         console = Console()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.commands.capture import body_lines, read_arm, read_body
+from mimic.commands.capture import body_lines, prepare_capture_inspection, read_arm, read_body
 from mimic.commands.config import CaptureConfig
 from mimic.motions.mocap.clips import slow_down_for
 from mimic.motions.mocap.link_motion import arm_motion
@@ -118,6 +118,14 @@ def test_inspect_shows_what_a_clip_has(clip, tmp_path):
         (str(clip), arm, f"clip_{arm}.npz") for arm in ("left", "right", "both")
     ]
     assert commands[-1].env == mimic.env_config("bimanual")
+
+
+def test_what_a_clip_lacks_is_said_of_its_own_key(tmp_path):
+    with pytest.raises(ValueError, match="^clip: no file at"):
+        prepare_capture_inspection(tmp_path / "none.bvh", CaptureConfig())
+    (tmp_path / "clip.bvh").write_text("")
+    with pytest.raises(ValueError, match=", got 'source:'$"):  # what the user wrote is not changed
+        prepare_capture_inspection(tmp_path / "clip.bvh", CaptureConfig(unit="source:"))
 
 
 def test_what_is_unusual_about_arms_is_named(tmp_path):

@@ -43,7 +43,13 @@ _UP = {".bvh": "y", ".trc": "y", ".c3d": "z", ".csv": "z", ".npz": "z"}  # where
 
 
 def read_motion(
-    path: str | os.PathLike[str], *, unit: str = "", up: str = "", subject: str = "", arm: ArmPoints | None = None
+    path: str | os.PathLike[str],
+    *,
+    unit: str = "",
+    up: str = "",
+    subject: str = "",
+    arm: ArmPoints | None = None,
+    key: str = "source",
 ) -> PointMotion:
     """Reads a motion capture file.
 
@@ -57,16 +63,17 @@ def read_motion(
       up: "x", "y", "z", "-x", "-y" or "-z".
       subject: the person to read, of several: the prefix of its points, or the root of its skeleton. "": the first.
       arm: names of points of an arm, in place of those that are found; no names where they are found.
+      key: name of the path in errors.
 
     Raises:
       ValueError: no file, or one of another kind, damaged, or without a unit that can be found.
     """
     source = Path(path)
     if not source.is_file():
-        raise ValueError(f"source: no file at {str(source)!r}")
+        raise ValueError(f"{key}: no file at {str(source)!r}")
     suffix = source.suffix.lower()
     if suffix not in KINDS:
-        raise ValueError(f"source: expected a file that ends in {', '.join(KINDS)}, got {str(source)!r}")
+        raise ValueError(f"{key}: expected a file that ends in {', '.join(KINDS)}, got {str(source)!r}")
     for name, value, choices in (("unit", unit, tuple(UNITS)), ("up", up, UPS)):
         if value:
             check_choice(name, value, choices)
@@ -82,7 +89,7 @@ def read_motion(
             motion = _noted(motion, f"up: {up}, {how}")
         return _without_stretched(_without_frozen(_in_metres_z_up(motion, unit or stated, up)))
     except (ValueError, OSError) as error:
-        raise ValueError(f"source: {str(source)!r}: {error}") from error
+        raise ValueError(f"{key}: {str(source)!r}: {error}") from error
 
 
 def _read(path: Path, suffix: str) -> Table:
