@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.motions.cleaning import Notes, beyond_range, cleaned
-from mimic.motions.demonstrations import RECORDED_SPEED, Demonstrations, check_effort
+from mimic.motions.demonstrations import RECORDED_SPEED, Demonstrations, check_effort, is_demonstrations
 from mimic.motions.formats.archives import read_archive
 from mimic.motions.formats.episodes import Motion, Recording
 from mimic.motions.formats.hdf5 import SUFFIXES, is_hdf5, read_hdf5
@@ -217,6 +217,11 @@ def read_source(source: Path, names: Sequence[str], topic: str, rate: float | No
         raise ValueError(f"source: no file at {str(source)!r}")
     if not source.name.lower().endswith(SOURCES):
         raise ValueError(f"source: expected a file that ends in {', '.join(SOURCES)}, got {str(source)!r}")
+    if is_demonstrations(source):
+        raise ValueError(
+            f"source: {str(source)!r} has demonstrations in mimic's own format, which need no import; "
+            "env.demonstrations.path=FILE of mimic.train trains on them"
+        )
     return read_table(source, names, rate) if source.name.lower().endswith(TABLES) else read_archive(source, names)
 
 

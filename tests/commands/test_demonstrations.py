@@ -8,6 +8,7 @@ import pytest
 import mimic
 from mimic.commands.config import RecordingConfig
 from mimic.commands.demonstrations import prepare_recording
+from mimic.motions.demonstrations import FORMAT
 from tests.helpers.commands import run
 
 
@@ -43,6 +44,10 @@ def test_the_command_records_what_the_library_does(tmp_path):
         ),
         (["out=new.npz", "arm=left"], "arm: expected none without source=FILE"),
         (["out=new.npz", "source={csv}", "capture.yaw=90"], "capture: expected none with a source of joint angles"),
+        (
+            ["out=new.npz", "source={recorded}"],
+            "recorded.npz' has demonstrations in mimic's own format, which need no import; env.demonstrations.path=",
+        ),
         (["out=new.npz", "source={csv}", "topic=/a"], "topic: expected only for a LeRobot dataset, a rosbag2 or HDF5"),
         (["out=new.npz", "topic=/a"], "topic: expected none without source="),
         (["out=new.npz", "joints=[a]"], "joints: expected none without source=FILE"),
@@ -50,7 +55,9 @@ def test_the_command_records_what_the_library_does(tmp_path):
     ],
 )
 def test_bad_input_of_the_command(reason, tmp_path, arguments, message):
-    paths = {"taken": tmp_path / "taken.npz", "csv": tmp_path / "motions.csv", "folder": tmp_path}
+    files = {"taken": "taken.npz", "csv": "motions.csv", "folder": "", "recorded": "recorded.npz"}
+    paths = {name: tmp_path / file for name, file in files.items()}
+    np.savez(paths["recorded"], format=FORMAT)
     paths["taken"].write_text("")
     (tmp_path / "drawn.png").write_text("")
     paths["csv"].write_text("time,joint1\n0,0\n")
