@@ -199,7 +199,8 @@ def _first_undamaged(run_dir: Path, step: int | None, read: Callable[[Path], T])
     if not steps:
         raise ValueError(f"{str(run_dir)!r} has no checkpoint")
     if step is not None and step not in steps:
-        raise ValueError(f"{str(run_dir)!r} has no checkpoint {step}; it has {', '.join(map(str, steps))}")
+        valid = ", ".join(map(str, steps))
+        raise ValueError(f"checkpoint: expected one of {valid}, the steps that {str(run_dir)!r} has, got {step}")
     candidates = steps[::-1] if step is None else [step]
     for candidate in candidates:
         path = _path(run_dir, candidate)

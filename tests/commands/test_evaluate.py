@@ -140,7 +140,7 @@ def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
         (["physics=bullet"], "physics: expected one of mjx, fused, got 'bullet'"),
         (["split=validation"], "split: expected one of test, got 'validation'"),
         (["split=test", "demonstrations=x.npz"], "split, demonstrations, robot: expected one of them, got several"),
-        (["checkpoint=7"], "has no checkpoint 7; it has 0"),
+        (["checkpoint=7"], "checkpoint: expected one of 0, the steps that"),
         (["mass=0"], "mass: expected a number from 0.001 to 1000, got 0.0"),
     ],
 )

@@ -160,7 +160,9 @@ def test_a_policy_of_many_arms_is_rejected(reason, tmp_path):
 
 
 def test_bad_input_is_one_line(mapped, rejected):
-    assert "has no checkpoint 6; it has 5" in rejected("export", f"run={mapped}", "out=new.onnx", "checkpoint=6")
+    assert "checkpoint: expected one of 5, the steps that" in rejected(
+        "export", f"run={mapped}", "out=new.onnx", "checkpoint=6"
+    )
 
 
 def test_a_mapper_whose_arms_differ_from_its_config_is_rejected(mapped, reason, tmp_path):
