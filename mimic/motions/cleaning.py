@@ -9,13 +9,13 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mimic.motions.demonstrations import OVERSHOOT
 from mimic.motions.formats.episodes import Motion
 from mimic.motions.resampling import angles_and_velocities
 
 FULL_TURN = 2 * np.pi - 1e-6  # rad: a range of a full rotation or more is that of a joint that turns on
 _MAX_ANGLE = 4 * np.pi  # rad, of such a joint: beyond, the angles are no rad
 _MAX_TURNS = 2  # by which a joint is rotated into its range
-OVERSHOOT = 0.02  # rad, 1 degree: how far measured angles may lie beyond a joint's range
 _FAR_BEYOND = 0.1  # rad, more than zeros of real arms differ from those of their models
 # A jump is what a joint cannot do between two samples: a step of more than 0.15 rad (9 deg) that would need more than
 # 100 rad/s^2, several times what arms reach, or 3 rad/s more than before and after.

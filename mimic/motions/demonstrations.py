@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import pose_limits
 from mimic.base.npz import read_arrays
 
 FORMAT = "mimic-demonstrations-1"
@@ -20,6 +21,7 @@ CLIPS = "clips"  # kind of the motions of a file that does not say what drove th
 MAX_VALUE = 1e6  # rad, rad/s, N m, s: no arm's motion has larger values
 _STILL = 0.3  # probability that a joint of a smaller crossover stays at the start
 _ROUNDING = 1e-6  # relative tolerance of a value above its limit: a file in float32 rounds by 6e-8
+OVERSHOOT = 0.02  # rad, 1 degree: how far measured angles may lie beyond a joint's range
 RECORDED_SPEED = 3.0  # times the model's velocity limit, which a recorded joint may have: some state 1 rad/s for all
 
 
@@ -151,7 +153,9 @@ def concatenate(first: Demonstrations, second: Demonstrations) -> Demonstrations
 
 
 def check_effort(demonstrations: Demonstrations, arm: Embodiment, speed: float = 1.0) -> None:
-    """Raises a ValueError if a joint exceeds its velocity limit, or its torque limit where torques are known.
+    """Raises a ValueError if a joint exceeds its range or velocity limit, or its torque limit where torques are known.
+
+    Measured angles may lie 0.02 rad beyond a range; a joint that can rotate by a full revolution has none.
 
     Args:
       demonstrations: of the arm.
@@ -173,6 +177,15 @@ def check_effort(demonstrations: Demonstrations, arm: Embodiment, speed: float =
                 f"{values[demonstration, sample, joint]:.7g} {unit} at {sample * demonstrations.dt:.4g} s, "
                 f"but its {quantity} limit is {limit[joint]:.7g} {unit}"
             )
+    lower, upper = pose_limits(arm, float)
+    outside = np.argwhere(np.maximum(lower - demonstrations.qpos, demonstrations.qpos - upper) > OVERSHOOT)
+    if len(outside):
+        demonstration, sample, joint = outside[0]
+        raise ValueError(
+            f"demonstrations: {arm.joint_names[joint]} of demonstration {demonstration} is at "
+            f"{demonstrations.qpos[demonstration, sample, joint]:.4g} rad at {sample * demonstrations.dt:.4g} s, "
+            f"but its range is {lower[joint]:.4g} to {upper[joint]:.4g} rad"
+        )
 
 
 def crossovers(

@@ -125,7 +125,7 @@ def test_demonstrations_of_another_arm_time_step_or_length_are_rejected(recorded
         recorded.check_fits(expert, dt, horizon)
 
 
-def test_torques_and_velocities_beyond_the_limits_are_rejected_and_rounding_passes(recorded):
+def test_angles_torques_and_velocities_beyond_the_limits_are_rejected_and_rounding_passes(recorded):
     arm = panda().embodiment
     with pytest.raises(ValueError, match="has a torque of 87.1 N m at 0.4 s, but its torque limit is 87 N m"):
         mimic.check_effort(changed(recorded, "torque", 87.1), arm)
@@ -135,6 +135,13 @@ def test_torques_and_velocities_beyond_the_limits_are_rejected_and_rounding_pass
         mimic.check_effort(changed(bare, "qvel", -2.2), arm)
     at_limit = changed(changed(recorded, "qvel", np.float32(2.175)), "torque", -87.0)
     mimic.check_effort(at_limit, arm)
+    joint_range = np.where(np.arange(7)[:, None] == 2, [-2.9, 2.9], arm.joint_range)
+    narrow = dataclasses.replace(arm, joint_range=joint_range)
+    message = "joint3 of demonstration 1 is at -3 rad at 0.4 s, but its range is -2.9 to 2.9 rad"
+    with pytest.raises(ValueError, match=message):
+        mimic.check_effort(changed(recorded, "qpos", -3.0), narrow)
+    mimic.check_effort(changed(recorded, "qpos", -2.91), narrow)  # as far as the readers of recordings take
+    mimic.check_effort(changed(recorded, "qpos", 9.0), arm)  # whose joints can rotate by a full revolution
     mimic.check_effort(changed(recorded, "torque", 1e6), dataclasses.replace(arm, torque_limit=np.full(7, np.inf)))
 
 
