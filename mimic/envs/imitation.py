@@ -362,10 +362,23 @@ class ImitationEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        """Length of an observation: numbers of each observed link and hand, and what terms or a subclass change."""
-        if self._has_own_observation or self.observation_terms:
-            return jax.eval_shape(lambda: self.observe(self.start(jax.random.PRNGKey(0)))).size
-        return observation_layout(self.expert, self.learner, self.config.preview, {})[-1]["stop"]
+        """Length of an observation: numbers of each observed link and hand, and what terms or a subclass change.
+
+        Raises:
+          ValueError: the config names terms that a subclass does not observe.
+        """
+        if not (self._has_own_observation or self.observation_terms):
+            return observation_layout(self.expert, self.learner, self.config.preview, {})[-1]["stop"]
+        size, terms = _observed_size(self), self.config.observation.terms
+        if terms and type(self).observe is not ImitationEnv.observe:
+            without = copy.copy(self)
+            without.observation_terms = []
+            if size == _observed_size(without):
+                raise ValueError(
+                    f"observation.terms: expected none with {type(self).__name__}, whose observe() leaves them out, "
+                    f"got {terms}"
+                )
+        return size
 
     @property
     def action_size(self) -> int:
@@ -423,6 +436,10 @@ def env_class(config: EnvConfig) -> type[ImitationEnv]:
             f"environment: {config.environment!r}: expected a subclass of ImitationEnv, got {registered!r}"
         )
     return registered
+
+
+def _observed_size(env: ImitationEnv) -> int:
+    return jax.eval_shape(lambda: env.observe(env.start(jax.random.PRNGKey(0)))).size
 
 
 def observed_parts(states: LinkStates) -> list[Array]:

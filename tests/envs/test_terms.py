@@ -185,6 +185,22 @@ def test_a_registered_class_is_made(own_registry):
     assert env.observation_size == 2 and layout_of(env)[0]["name"] == "observation of Angles"
 
 
+def test_terms_that_a_class_does_not_observe_are_rejected(terms):
+    class Bare(mimic.ImitationEnv):
+        def observe(self, state):
+            return state.qpos
+
+    class More(mimic.ImitationEnv):
+        def observe(self, state):
+            return jnp.append(super().observe(state), 7.0)
+
+    config = mimic.env_config("planar4dof", physics="fused", **SMALL, observation=terms["observation"])
+    message = r"observation.terms: expected none with Bare, whose observe\(\) leaves them out, got \['angles', "
+    with pytest.raises(ValueError, match=message):
+        _ = Bare(config).observation_size
+    assert More(config).observation_size == mimic.ImitationEnv(config).observation_size + 1
+
+
 def test_demonstrations_are_those_of_a_source(own_registry):
     recorded = mimic.make("planar4dof", physics="fused", **SMALL).demonstrations
 
