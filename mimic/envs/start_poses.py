@@ -1,14 +1,15 @@
 """Where the learner starts its episodes, at rest."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
-from mimic.base.compilation import on_host
+from mimic.base.compilation import UNOPTIMIZED, compiled_once, on_host
 from mimic.control import clearance
 from mimic.metric.capsule_distances import clearance_constants, colliding_pairs
 from mimic.retargeting.costs import Costs
@@ -62,13 +63,22 @@ def _nearest_poses(
     capsules: Capsules | None = None,
 ) -> Float[np.ndarray, "poses joints"]:
     """The poses nearest to the expert's, see `imitate_pose`."""
-    size, starts = _WITH_CAPSULES if capsules else _WITHOUT
-    costs = Costs(home=_HOME, self_collision=_SELF_COLLISION if capsules else 0.0, clearance=CLEARANCE)
-    options = {"starts": starts, "costs": costs, "capsules": capsules, **metric}
+    size, _ = _WITH_CAPSULES if capsules else _WITHOUT
     with on_host():  # compiles several times faster, and runs once
-        (nearest,) = by_chunks(
-            lambda poses: (imitate_pose(expert, learner, jnp.asarray(poses), **options).qpos,),
-            np.asarray(qpos, np.float32),
-            size=size,
-        )
+        solve = _pose_solver(expert, learner, metric, capsules)
+        (nearest,) = by_chunks(lambda poses: (solve(poses),), np.asarray(qpos, np.float32), size=size)
     return nearest
+
+
+@functools.partial(compiled_once, options=UNOPTIMIZED)
+def _pose_solver(
+    expert: Embodiment, learner: Embodiment, metric: dict[str, Any], capsules: Capsules | None
+) -> Callable[[Array], Array]:
+    """The function of the expert's poses that `_nearest_poses` compiles."""
+    _, starts = _WITH_CAPSULES if capsules else _WITHOUT
+    costs = Costs(home=_HOME, self_collision=_SELF_COLLISION if capsules else 0.0, clearance=CLEARANCE)
+
+    def solve(poses: Array) -> Array:
+        return imitate_pose(expert, learner, poses, starts=starts, costs=costs, capsules=capsules, **metric).qpos
+
+    return solve
