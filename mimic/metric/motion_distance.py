@@ -122,15 +122,30 @@ def gradient_by_learner(
         hands = 0 if expert_states.hand is None else len(expert_states.hand.position)
         factors = np.asarray(metric.factors(hands, len(learner.hand_joint)), float)
         arm = in_chain_lengths(_as_numpy(learner))
-        function = functools.partial(analytic_gradient.gradient_by_learner, arm, factors)
-        of_rows = fused_kernel.fused(function, [2 * arm.num_joints])
-        return of_rows(_rows(expert_states, factors.shape[1]), qpos, qvel)[0]
+        return _gradient_in_stages(arm, factors)(_rows(expert_states, factors.shape[1]), qpos, qvel)[0]
 
     def distance(qpos: Array, qvel: Array) -> Array:
         return metric(expert_states, link_states(learner, qpos, qvel))
 
     gradient = jnp.concatenate(jax.grad(distance, argnums=(0, 1))(qpos, qvel))
     return jnp.where(jnp.isfinite(gradient), gradient, 0)
+
+
+def _gradient_in_stages(learner: Embodiment, factors: np.ndarray) -> Callable[..., tuple[Array, ...]]:
+    """The gradient as a function of `_rows`, qpos and qvel; two kernels on a GPU: one takes three times to compile."""
+    by_states, by_motion = (
+        functools.partial(stage, learner, factors)
+        for stage in (analytic_gradient.gradient_by_states, analytic_gradient.gradient_by_motion)
+    )
+    first = fused_kernel.gpu_kernel(by_states, [12 * factors.shape[2]])
+    second = fused_kernel.gpu_kernel(by_motion, [2 * learner.num_joints])
+
+    def of_sample(*vectors: Array) -> tuple[Array, ...]:
+        rows, *motion = ([vector[k] for k in range(vector.shape[0])] for vector in vectors)
+        (gradient,) = by_motion(by_states(rows, *motion)[0], *motion)
+        return (jnp.stack([jnp.asarray(x, vectors[0].dtype) for x in gradient]),)
+
+    return fused_kernel.batched_by(lambda rows, *motion: second(*first(rows, *motion), *motion), of_sample)
 
 
 def _rows(states: LinkStates, count: int) -> Float[Array, " components"]:
