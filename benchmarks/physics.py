@@ -22,7 +22,7 @@ import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect, print_table
 from mimic.envs.imitation import ImitationEnv
-from mimic.physics.step import Load, make_advance
+from mimic.physics.step import make_advance
 
 ENVS = ("panda7dof", "panda4dof", "panda3dof")
 STEPS = 50  # control steps of a sequence
@@ -62,7 +62,7 @@ def own_motion(env: ImitationEnv, torques: np.ndarray, physics: str, substeps: i
     home = jnp.asarray(env.learner.home, jnp.float32)
 
     def step(state: tuple[jax.Array, jax.Array], torque: jax.Array) -> Any:
-        state = advance(*state, torque, Load())
+        state = advance(*state, torque)
         return state, state
 
     sequence = jax.jit(jax.vmap(lambda torques: jax.lax.scan(step, (home, jnp.zeros_like(home)), torques)[1]))

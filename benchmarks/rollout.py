@@ -27,7 +27,7 @@ from benchmarks.common.timing import Timing, time_call, time_program
 from benchmarks.peers import stock
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import wrap_for_training
-from mimic.physics.step import Load, make_advance
+from mimic.physics.step import make_advance
 
 ENVS = ("panda7dof", "panda4dof", "panda3dof")
 ARMS = [512, 8192, 65536]
@@ -53,7 +53,7 @@ def own_physics(physics: str, env: ImitationEnv, arms: int) -> Timing:
     substeps = env.config.substeps
     advance = make_advance(env.arm.model, env.config.control_dt / substeps, substeps, physics)
     qpos, qvel, torques = random_motion(env, arms)
-    many: Any = jax.vmap(lambda qpos, qvel, torque: advance(qpos, qvel, torque, Load()))
+    many: Any = jax.vmap(advance)
     return time_steps(lambda state, torques: (many(*state, torques), None), (qpos, qvel), torques)
 
 

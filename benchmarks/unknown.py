@@ -47,7 +47,6 @@ from mimic.physics import dynamics
 from mimic.physics.inner_loop import LoopState
 from mimic.physics.joint_numbers import NUMBERS, joint_of
 from mimic.physics.plant import Draw
-from mimic.physics.step import Load
 from mimic.physics.world import WorldConfig
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import TrainConfig
@@ -85,9 +84,9 @@ def worlds(trained: WorldConfig) -> Iterator[tuple[str, WorldConfig]]:
 
 def data_sheet(env: HardwareEnv) -> Draw:
     """The model that a controller has without measuring the arm."""
-    ones, one, zero = jnp.ones(env.learner.num_joints), jnp.ones(()), jnp.zeros(())
+    ones, zero = jnp.ones(env.learner.num_joints), jnp.zeros(())
     delay = jnp.asarray(DATA_SHEET.action_delay[0])
-    return Draw(ones, zero, zero, zero, ones, ones, 0 * ones, 0 * delay, delay, Load(one, one))
+    return Draw(ones, zero, zero, zero, ones, ones, 0 * ones, 0 * delay, delay)
 
 
 def model_torque(env: HardwareEnv, draw: Draw, qpos: Array, qvel: Array, qacc: Array) -> Array:

@@ -32,7 +32,7 @@ class StockEnv(Wrapper):
         start = self._imitation.start(rng)
         data = mjx.forward(self._model, self._blank.replace(qpos=start.qpos, qvel=start.qvel))
         zero = jnp.zeros(())
-        info = {"arm_state": dataclasses.replace(start, load=None)}
+        info = {"arm_state": start}
         return State(data, self._imitation.observe(start), zero, zero, {"distance": zero}, info)  # type: ignore[arg-type]
 
     def step(self, state: State, action: jax.Array) -> State:

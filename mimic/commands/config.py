@@ -28,11 +28,6 @@ ARM_SIDES = ("left", "right")
 DATASET_FORMATS = ("lerobot", "rosbag2")
 
 
-def _factor() -> Any:
-    """Field for a factor on masses or damping, as in `RandomizationConfig`."""
-    return number(None, at_least=1e-3, at_most=1e3)
-
-
 def _check_locked(locked: list[Any], learner: str) -> None:
     """Raises a `ValueError` for locked joints without the arm that they belong to."""
     if locked and not learner:
@@ -52,7 +47,6 @@ class EvaluateConfig:
       demonstrations: file of demonstrations that replace the held-out ones; episodes have their length.
       split: "test": the test set replaces the held-out demonstrations, see `test_demonstrations`. Default "": none.
       physics: see `EnvConfig`. Default "": that of the run.
-      mass, damping: factors on the arm's model, see `RandomizationConfig`. Default None: as in training.
       robot: "virtual_panda": the policy, or "tracking", controls virtual Pandas in C MuJoCo, which abort as real ones
         do; "virtual_robot": the same for another learner. Default "": the environment of the run.
       episodes: number of episodes of `robot`, of each case with `edges`.
@@ -73,8 +67,6 @@ class EvaluateConfig:
     demonstrations: str = ""
     split: str = ""
     physics: str = ""
-    mass: float | None = _factor()
-    damping: float | None = _factor()
     robot: str = ""
     episodes: int = number(1000, at_least=1, at_most=10_000_000)
     robot_world: str = ""
@@ -110,8 +102,7 @@ class EvaluateConfig:
             raise ValueError(
                 f"controller: expected {' or '.join(ROBOT_CONTROLLERS)} with robot=, got {self.controller}"
             )
-        others = "learner", "physics", "mass", "damping"
-        check_unused(self, others, "with robot=, whose world has ranges of masses, damping and friction")
+        check_unused(self, ("learner", "physics"), "with robot=, whose physics are C MuJoCo's")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -89,26 +89,20 @@ def prepare_report(config: EvaluateConfig, started: float, console: Console) -> 
 
 
 def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Trainer]:
-    """The trainer of a run, with the demonstrations, the physics and the arm parameters of the evaluation."""
+    """The trainer of a run, with the demonstrations and the physics of the evaluation."""
     check_checkpoint(run_dir, config.checkpoint)
-    factors = {"mass": config.mass, "damping": config.damping}
-    changes = {key: [value, value] for key, value in factors.items() if value is not None}
     if trained.trainer.name != "ppo":
         others = config.physics, config.demonstrations, config.split, config.learner
-        if changes or any(others) or config.controller != "policy":
+        if any(others) or config.controller != "policy":
             raise ValueError(
-                "controller, learner, demonstrations, split, physics, mass, damping: expected a run of "
-                f"trainer=ppo, got one of {trained.trainer.name}"
+                "controller, learner, demonstrations, split, physics: expected a run of trainer=ppo, got one of "
+                f"{trained.trainer.name}"
             )
         return trained, make_trainer(trained, run_dir)
     _check_arms(trained.env, config)
     _check_commands(trained.env, config.controller)
     base = with_one_learner(trained.env, config.learner, config.locked) if config.learner else trained.env
-    env = dataclasses.replace(
-        base,
-        physics=config.physics or base.physics,
-        randomization=dataclasses.replace(base.randomization, **changes),
-    )
+    env = dataclasses.replace(base, physics=config.physics or base.physics)
     evaluated = dataclasses.replace(trained, env=env)
     unseen = _unseen(config, env)
     shared = make_ppo_trainer(trained, run_dir) if config.learner else None
@@ -156,5 +150,4 @@ def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
         **({"learner": config.learner, "locked": config.locked} if config.learner else {}),
         "demonstrations": config.demonstrations or config.split,
         "physics": env.physics,
-        **dataclasses.asdict(env.randomization),
     }

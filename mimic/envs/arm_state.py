@@ -9,8 +9,6 @@ from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from mimic.physics.step import Load
-
 
 @struct.dataclass
 class ArmState:
@@ -22,7 +20,6 @@ class ArmState:
       step: control steps since the start of the demonstration.
       demonstration: index of the demonstration.
       key: random key for the noise of this episode and for the following episodes.
-      load: factors on the arm's dynamics in this episode; None where all episodes have the same.
     """
 
     qpos: Float[Array, " joints"]
@@ -30,7 +27,6 @@ class ArmState:
     step: Int[Array, ""]
     demonstration: Int[Array, ""]
     key: Array
-    load: Load | None = None
 
 
 def arm_state(state: State) -> ArmState:

@@ -11,7 +11,7 @@ from mimic.base.ranges import check_ranges, number
 from mimic.control.joint_control import MODES
 from mimic.metric.config import MetricConfig
 from mimic.motions.experts import KINDS, MIXED
-from mimic.physics.world import AUTO, PHYSICS, RandomizationConfig, WorldConfig
+from mimic.physics.world import AUTO, PHYSICS, WorldConfig
 
 Kind = Literal["one_arm", "inner_loop", "sampled_arms"]
 REWARD_TERMS, OBSERVATION_TERMS = ("self_collision",), ("distance_gradient",)  # built in, see mimic/envs/terms.py
@@ -156,7 +156,6 @@ class EnvConfig:
       control: what an action is: "torque", which is constant in a control step (paper); or the target of an inner loop
         at 1 kHz: "joint_position" or "joint_velocity", see `mimic.control`; only in a `world`.
       world: gravity, friction, load, sensors and delays, and an inner loop at 1 kHz; null in the paper's world.
-      randomization: how the learner's dynamics differ from its model.
       preview: how many control steps ahead the learner also observes the expert; 0 is the paper.
       limit_weight: weight in the reward of joints near or beyond their range and velocity limit; only where `limits`
         is "hardware".
@@ -180,7 +179,6 @@ class EnvConfig:
     physics: str = AUTO
     control: str = "torque"
     world: WorldConfig | None = None
-    randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     preview: int = number(1, at_least=0, at_most=100)  # each step adds an expert to the observation
     limit_weight: float = number(1.0, at_least=0.0, at_most=1e6)
     action_scale: float = number(1.0, at_least=1e-3, at_most=1000.0)  # the torque is cut at the torque limit anyway

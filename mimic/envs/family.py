@@ -18,7 +18,6 @@ from mimic.arms.sampler import (
     random_arm,
 )
 from mimic.envs.config import ArmsConfig, EnvConfig, ObservationConfig, RewardConfig
-from mimic.physics.world import RandomizationConfig
 
 SEEN, UNSEEN = "seen", "unseen"
 _RANDOM_ARMS = 16  # in a report
@@ -67,7 +66,6 @@ def check_family(config: EnvConfig) -> None:
     supported = {
         "physics": ("auto", "fused"),
         "preview": (1,),
-        "randomization": (RandomizationConfig(),),
         "reward": (RewardConfig(),),
         "observation": (ObservationConfig(),),
         "environment": ("",),

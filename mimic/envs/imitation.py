@@ -33,7 +33,7 @@ from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 from mimic.motions.demonstrations import RECORDED_SPEED, Demonstrations, check_effort, load_demonstrations
 from mimic.motions.experts import KINDS, MIXED
 from mimic.motions.recording import record_demonstrations
-from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
+from mimic.physics.step import PhysicsChoice, choose_physics, make_advance
 
 # The limit penalty starts this margin inside a limit and is at its maximum a width further out; in rad for positions,
 # as a fraction of the velocity limit for speeds.
@@ -176,24 +176,17 @@ class ImitationEnv(Env):
 
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> ArmState:
         """The first state of an episode; the demonstration is random where None."""
-        key_demonstration, key_load, key_next = jax.random.split(key, 3)
+        key_demonstration, _, key_next = jax.random.split(key, 3)
         if demonstration is None:
             demonstration = jax.random.randint(key_demonstration, (), 0, self.demonstrations.count)
         demonstration = jnp.asarray(demonstration, jnp.int32)
         qpos = jnp.asarray(self.start_poses)[demonstration]
         zero = jnp.zeros((), jnp.int32)
-        return ArmState(qpos, jnp.zeros_like(qpos), zero, demonstration, key_next, self._draw_load(key_load))
+        return ArmState(qpos, jnp.zeros_like(qpos), zero, demonstration, key_next)
 
     def at_step(self, state: ArmState, step: Int[Array, ""]) -> ArmState:
         """A state of `start` at another step of its demonstration."""
         return dataclasses.replace(state, step=step)
-
-    def _draw_load(self, key: Array) -> Load | None:
-        mass, damping = self.config.randomization.mass, self.config.randomization.damping
-        if mass[0] == mass[1] and damping[0] == damping[1]:
-            return None
-        minimum, maximum = (jnp.array(bounds) for bounds in zip(mass, damping, strict=True))
-        return Load(*jax.random.uniform(key, (2,), minval=minimum, maxval=maximum))
 
     def step(self, state: State, action: Float[Array, " numbers"]) -> State:
         """Advances an episode by one control step.
@@ -261,10 +254,8 @@ class ImitationEnv(Env):
         self, before: ArmState, command: Float[Array, " numbers"]
     ) -> tuple[ArmState, Float[Array, " joints"]]:
         """The state after a control step of an action in [-1, 1], and the torque in it [N m], which is constant."""
-        randomization = self.config.randomization
-        load = Load(randomization.mass[0], randomization.damping[0]) if before.load is None else before.load
         torque = command * self.torque_scale
-        qpos, qvel = self._advance(before.qpos, before.qvel, torque, load)
+        qpos, qvel = self._advance(before.qpos, before.qvel, torque)
         return dataclasses.replace(before, qpos=qpos, qvel=qvel, step=before.step + 1), torque
 
     def commanded_torque(

@@ -32,7 +32,7 @@ from mimic.metric.distance import Metric
 from mimic.metric.kinematics import link_states
 from mimic.motions.demonstrations import Demonstrations
 from mimic.physics.composite_kernel import make_advance
-from mimic.physics.step import Load, PhysicsChoice
+from mimic.physics.step import PhysicsChoice
 from mimic.retargeting.array_goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
 
 _HOLD_SAMPLES = 5  # steps of a demonstration at which the distance of holding the home pose is computed
@@ -202,7 +202,7 @@ class AnyArmEnv(ImitationEnv):
     def _moved(self, before: AnyArmState, action: Float[Array, " actions"]) -> AnyArmState:
         """The state after a control step of constant torque, without its plan."""
         torque = self.command(before, action)
-        qpos, qvel = self._advance(before.arm, before.qpos, before.qvel, torque, Load())
+        qpos, qvel = self._advance(before.arm, before.qpos, before.qvel, torque)
         followed = chosen_goal(before.goals)
         return dataclasses.replace(before, qpos=qpos, qvel=qvel, step=before.step + 1, followed=followed)
 

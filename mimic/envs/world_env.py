@@ -111,13 +111,13 @@ class HardwareEnv(ImitationEnv):
         deviation = self.world.start_noise
         noise = jax.random.uniform(jax.random.fold_in(key, _START), (joints,), minval=-deviation, maxval=deviation)
         qpos = jnp.clip(state.qpos + noise, self.parameters.lower, self.parameters.upper) if deviation else state.qpos
-        draw = draw_episode(self.world, self.config.randomization, joints, jax.random.fold_in(key, _DRAW))
+        draw = draw_episode(self.world, joints, jax.random.fold_in(key, _DRAW))
         zero = jnp.zeros_like(qpos)
         actions = jnp.zeros((MAX_DELAY + 1, self.action_size))
         sent = jnp.zeros((max(SENT_ACTIONS, self.world.history), self.action_size))
         reference = Reference(qpos + draw.bias, zero, zero)  # where the arm seems to be
         fields = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
-        fields |= {"qpos": qpos, "load": None, "reference": reference, "torque": zero, "draw": draw}
+        fields |= {"qpos": qpos, "reference": reference, "torque": zero, "draw": draw}
         measured = self._measure(LoopState(qpos, zero, reference, zero), draw, state.key, state.step)
         history = jnp.tile(measured, (MAX_DELAY + 1 + self.world.history, 1))
         target = reference.qpos if self.config.control == "joint_position" else zero  # the arm stays where it is
@@ -181,7 +181,7 @@ class HardwareEnv(ImitationEnv):
     def privileged(self, state: ArmState) -> Float[Array, " numbers"]:
         """What only a critic observes: the elapsed time, what was drawn, and the true expert where it is measured."""
         draw = cast(HardwareState, state).draw
-        fractions = drawn_fractions(draw, self.world, self.config.randomization)
+        fractions = drawn_fractions(draw, self.world)
         parts = [super().privileged(state), fractions]
         if self.world.expert != "exact":
             parts.append(expert_vector([self.expert_at(state.demonstration, state.step + 1)]))

@@ -52,7 +52,7 @@ def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, ran
 
     Raises:
       TypeError: another environment than those of mimic.
-      ValueError: a `randomization_fn`; see `RandomizationConfig` for randomization.
+      ValueError: a `randomization_fn`; a `world` has ranges instead.
     """
     imitation = env.unwrapped
     if not isinstance(imitation, ImitationEnv):

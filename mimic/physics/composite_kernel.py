@@ -17,9 +17,9 @@ from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.base import fused_kernel
 from mimic.base.spatial import Scalar
 from mimic.physics import looped_dynamics
-from mimic.physics.dynamics import acceleration, loaded
+from mimic.physics.dynamics import acceleration, with_locks
 from mimic.physics.joint_numbers import NUMBERS, JointNumbers, joint_numbers, joint_of
-from mimic.physics.step import Load, runge_kutta
+from mimic.physics.step import runge_kutta
 from mimic.physics.trigonometry import cosine_and_sine
 
 LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest measured on an H100
@@ -27,11 +27,11 @@ LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest measured on
 Rows = tuple[tuple[Scalar, ...], ...]  # values of each joint
 
 
-AdvanceAny = Callable[[ArmArrays, Array, Array, Array, Load], tuple[Array, Array]]
+AdvanceAny = Callable[[ArmArrays, Array, Array, Array], tuple[Array, Array]]
 
 
 def make_advance(timestep: float, substeps: int) -> AdvanceAny:
-    """Makes a function (arm, qpos, qvel, torque, load) -> (qpos, qvel) of `substeps` steps with a constant torque.
+    """Makes a function (arm, qpos, qvel, torque) -> (qpos, qvel) of `substeps` steps with a constant torque.
 
     It integrates the forward dynamics by the classical fourth-order Runge-Kutta method, as MuJoCo's RK4 does. It takes
     one sample, and is a single kernel on NVIDIA GPUs if it is batched by `jax.vmap`. The vectors have a number for each
@@ -50,11 +50,9 @@ def make_advance(timestep: float, substeps: int) -> AdvanceAny:
         qpos: Float[Array, " joints"],
         qvel: Float[Array, " joints"],
         torque: Float[Array, " joints"],
-        load: Load,
     ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
-        factors = jnp.stack([jnp.asarray(x, qpos.dtype) for x in load])
         numbers = joint_numbers(arm).astype(qpos.dtype)
-        qpos, qvel = step(numbers, qpos, qvel, torque, factors)
+        qpos, qvel = step(numbers, qpos, qvel, torque)
         return qpos, qvel
 
     return advance
@@ -63,11 +61,11 @@ def make_advance(timestep: float, substeps: int) -> AdvanceAny:
 def array_step(timestep: float, substeps: int) -> Callable[..., tuple[Array, ...]]:
     """The steps on arrays [size, *batch], for other devices and for derivatives."""
 
-    def step(numbers: Array, qpos: Array, qvel: Array, torque: Array, load: Array) -> tuple[Array, ...]:
+    def step(numbers: Array, qpos: Array, qvel: Array, torque: Array) -> tuple[Array, ...]:
         by_joint = numbers.reshape(MAX_JOINTS, NUMBERS, *numbers.shape[1:])
 
         def acceleration(qpos: Array, qvel: Array) -> Array:
-            return looped_dynamics.acceleration(by_joint, qpos, qvel, torque, *load)
+            return looped_dynamics.acceleration(by_joint, qpos, qvel, torque)
 
         return runge_kutta(acceleration, qpos, qvel, timestep, substeps)
 
@@ -77,10 +75,10 @@ def array_step(timestep: float, substeps: int) -> Callable[..., tuple[Array, ...
 def gpu_kernel(
     timestep: float, substeps: int, *, launch: fused_kernel.LaunchConfig = LAUNCH
 ) -> Callable[..., tuple[Array, ...]]:
-    """A Pallas kernel of Runge-Kutta steps: (numbers, qpos, qvel, torque, load) -> (qpos, qvel).
+    """A Pallas kernel of Runge-Kutta steps: (numbers, qpos, qvel, torque) -> (qpos, qvel).
 
     Its arguments are arrays [samples, width]: `joint_numbers`, angles [rad], velocities [rad/s] and torques
-    [N m] of the 8 slots of joints, and the factors on masses and damping.
+    [N m] of the 8 slots of joints.
 
     Args:
       timestep: duration of a step [s].
@@ -89,10 +87,9 @@ def gpu_kernel(
     """
 
     def body(inputs: Sequence[fused_kernel.Columns], outputs: Sequence[fused_kernel.Columns]) -> None:
-        numbers, *states, torque, load = inputs
-        ((mass, damping),) = read_rows(load, 1)
-        joints = loaded(read_joints(numbers), mass, damping)
-        force = [x / mass for (x,) in read_rows(torque)]
+        numbers, *states, torque = inputs
+        joints = with_locks(read_joints(numbers))
+        force = [x for (x,) in read_rows(torque)]
 
         def qacc(qpos: tuple[Scalar, ...], qvel: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
             return acceleration(joints, qpos, qvel, force, trigonometry=cosine_and_sine)

@@ -45,10 +45,10 @@ def acceleration(
     """Forward dynamics: joint accelerations [rad/s^2] under joint torques; 0 for locked joints.
 
     Args:
-      joints: each after its parent, from `loaded`.
+      joints: each after its parent; those of an arm as data from `with_locks`.
       qpos: joint angles [rad].
       qvel: joint velocities [rad/s]; those of locked joints are 0.
-      torque: joint torques over the factor on masses [N m].
+      torque: joint torques [N m].
       base: acceleration of the base, in the frame of the first joint at angle 0 [m/s^2]: minus gravity. 0 where None.
       trigonometry: cosine and sine of an angle.
     """
@@ -61,26 +61,9 @@ def acceleration(
     return elimination.solution()
 
 
-def loaded(joints: Sequence[JointNumbers], mass: Scalar, damping: Scalar) -> list[JointNumbers]:
-    """The joints under a load, over the factor on masses: dividing these few numbers is cheaper than multiplying all.
-
-    The armature of a locked joint is infinite, so that its acceleration is 0.
-
-    Args:
-      joints: of the arm.
-      mass: factor on the masses and inertias of all bodies.
-      damping: factor on the damping of all joints.
-    """
-    inverse = 1.0 / mass
-
-    def armature(joint: JointNumbers) -> Scalar:
-        value = times(joint.armature, inverse)
-        return value if isinstance(joint.is_free, float) else jnp.where(joint.is_free > 0, value, math.inf)
-
-    return [
-        joint._replace(armature=armature(joint), damping=times(joint.damping, times(damping, inverse)))
-        for joint in joints
-    ]
+def with_locks(joints: Sequence[JointNumbers]) -> list[JointNumbers]:
+    """The joints of an arm as data, where locked ones have an infinite armature, so that their acceleration is 0."""
+    return [joint._replace(armature=jnp.where(joint.is_free > 0, joint.armature, math.inf)) for joint in joints]
 
 
 def inverse(

@@ -17,7 +17,7 @@ from mimic.control import joint_control
 from mimic.control.joint_control import PERIOD, JointParameters, Reference
 from mimic.physics import composite_kernel, looped_dynamics
 from mimic.physics.composite_kernel import read_joints, read_rows, write_rows
-from mimic.physics.dynamics import acceleration, loaded
+from mimic.physics.dynamics import acceleration, with_locks
 from mimic.physics.joint_numbers import NUMBERS
 from mimic.physics.trigonometry import cosine_and_sine
 
@@ -157,11 +157,10 @@ def array_loop(mode: str, constants: JointConstants, periods: int) -> Callable[.
         by_row = (jnp.moveaxis(x.reshape(joints, -1, *batch), 1, 0) for x in (drive, motion))
         drives, motions = map(list, by_row)
         parameters = jax.tree.map(lambda x: jnp.asarray(x, motion.dtype).reshape(joints, *[1] * len(batch)), constants)
-        one = jnp.ones((), motion.dtype)
 
         def period(_: Any, state: LoopState) -> LoopState:
             reference, torque, acting = control(mode, parameters, state, target, drives)
-            qacc = looped_dynamics.acceleration(by_joint, state.qpos, state.qvel, acting, one, one, tuple(base))
+            qacc = looped_dynamics.acceleration(by_joint, state.qpos, state.qvel, acting, tuple(base))
             qvel = state.qvel + PERIOD * qacc
             return LoopState(state.qpos + PERIOD * qvel, qvel, reference, torque)
 
@@ -189,7 +188,7 @@ def gpu_kernel(
     def body(inputs: Sequence[fused_kernel.Columns], outputs: Sequence[fused_kernel.Columns]) -> None:
         numbers, base, *of_joints = inputs
         (base_acceleration,) = read_rows(base, 1)
-        joints = loaded(read_joints(numbers, count), 1.0, 1.0)  # they have the masses of the episode
+        joints = with_locks(read_joints(numbers, count))
         drives, motions, targets = (read_rows(columns, count) for columns in of_joints)
 
         def period(_: Any, states: tuple[LoopState, ...]) -> tuple[LoopState, ...]:

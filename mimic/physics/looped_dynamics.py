@@ -1,7 +1,8 @@
 """Forward dynamics of any arm as loops over the joints, on arrays with the batch as their last axis, for CPUs.
 
-XLA's CPU backend compiles the loops four times as fast as unrolled equations, and they run faster there: an
-operation is a loop over adjacent samples, and XLA repeats less computation in the results of a loop's short body.
+XLA's CPU backend compiles the loops five times as fast as the unrolled equations of mimic/physics/dynamics.py, and
+they run twice as fast there: an operation is a loop over adjacent samples, and XLA repeats less computation in the
+results of a loop's short body. Ten steps of 512 Pandas on two cores: 0.6 s and 30 ms, against 3.0 s and 59 ms.
 """
 
 from typing import Any
@@ -23,8 +24,6 @@ def acceleration(
     qpos: Joints,
     qvel: Joints,
     torque: Joints,
-    mass: Float[Array, "*batch"],
-    damping: Float[Array, "*batch"],
     base: Any = None,
 ) -> Joints:
     """Forward dynamics: joint accelerations [rad/s^2] under joint torques; 0 for locked joints.
@@ -34,16 +33,13 @@ def acceleration(
       qpos: joint angles [rad].
       qvel: joint velocities [rad/s].
       torque: joint torques [N m].
-      mass: factor on the masses and inertias of all bodies.
-      damping: factor on the damping of all joints.
       base: three components of the base's acceleration, see mimic/physics/dynamics.py; 0 where None.
     """
     joints = joint_of(jnp.moveaxis(numbers, 1, 0))
     angles = qpos + joints.reference
     turns = jnp.cos(angles), jnp.sin(angles)
     matrix, bias = _mass_matrix_and_bias(numbers, turns, _wrenches(numbers, turns, qvel, base))
-    force = (torque - damping * joints.damping * qvel) / mass - bias
-    return _solve(matrix, joints.armature / mass, force, joints.is_free)
+    return _solve(matrix, joints.armature, torque - joints.damping * qvel - bias, joints.is_free)
 
 
 def _wrenches(numbers: Array, turns: _Turns, qvel: Joints, base: Any) -> Any:

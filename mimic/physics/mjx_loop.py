@@ -52,13 +52,11 @@ def make_mjx_loop(mode: str, plant: Plant, world: MujocoWorld, periods: int) -> 
 
 
 def _with_draw(model: mjx.Model, world: MujocoWorld, draw: Draw) -> mjx.Model:
-    """The model with the masses, the damping, the payload and the gravity of an episode."""
-    link_mass = draw.load.mass * draw.link_mass
-    fields = loaded_fields(world, draw.gravity_error, link_mass, draw.payload, draw.payload_lever, jnp)
+    """The model with the masses, the payload and the gravity of an episode."""
+    fields = loaded_fields(world, draw.gravity_error, draw.link_mass, draw.payload, draw.payload_lever, jnp)
     return model.replace(
         opt=model.opt.replace(gravity=fields.gravity),
         body_mass=fields.body_mass,
         body_inertia=fields.body_inertia,
         body_ipos=fields.body_ipos,
-        dof_damping=draw.load.damping * model.dof_damping,
     )

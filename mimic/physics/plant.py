@@ -17,8 +17,7 @@ from mimic.control.joint_control import PERIOD
 from mimic.control.limits import joint_parameters
 from mimic.physics.inner_loop import Episode, JointConstants
 from mimic.physics.joint_numbers import NUMBERS, joint_numbers
-from mimic.physics.step import Load
-from mimic.physics.world import RandomizationConfig, WorldConfig
+from mimic.physics.world import WorldConfig
 
 GRAVITY = 9.81  # m/s^2
 # Mechanical stops as critically damped springs: stiff, and slow enough for steps of 1 ms.
@@ -40,7 +39,6 @@ class Draw:
       bias: [joints] error of the measured angles [rad].
       observation_delay: age of the measurement that is observed, in ticks.
       action_delay: time from an observation until its action acts, in ticks.
-      load: factors on the masses and the damping, see `RandomizationConfig`.
     """
 
     link_mass: Float[Array, " joints"]
@@ -52,12 +50,11 @@ class Draw:
     bias: Float[Array, " joints"]
     observation_delay: Int[Array, ""]
     action_delay: Int[Array, ""]
-    load: Load
 
 
-def draw_episode(world: WorldConfig, randomization: RandomizationConfig, joints: int, key: Array) -> Draw:
-    """Draws an episode from the ranges of a world and a randomization."""
-    keys = iter(jax.random.split(key, 11))
+def draw_episode(world: WorldConfig, joints: int, key: Array) -> Draw:
+    """Draws an episode from the ranges of a world."""
+    keys = iter(jax.random.split(key, 9))
 
     def drawn(name: str, bounds: Sequence[float]) -> Array:
         if name in _TICKS:
@@ -65,17 +62,15 @@ def draw_episode(world: WorldConfig, randomization: RandomizationConfig, joints:
         shape = (joints,) if name in _OF_JOINTS else ()
         return jax.random.uniform(next(keys), shape, minval=bounds[0], maxval=bounds[1])
 
-    numbers = {name: drawn(name, bounds) for name, bounds in _bounds(world, randomization).items()}
-    return Draw(load=Load(numbers.pop("mass"), numbers.pop("damping")), **numbers)
+    return Draw(**{name: drawn(name, bounds) for name, bounds in _bounds(world).items()})
 
 
-def drawn_fractions(draw: Draw, world: WorldConfig, randomization: RandomizationConfig) -> Float[Array, " numbers"]:
+def drawn_fractions(draw: Draw, world: WorldConfig) -> Float[Array, " numbers"]:
     """What was drawn for an episode, each number from -1 to 1 over its range, 0 where that has no width."""
-    numbers = vars(draw) | draw.load._asdict()
     return jnp.concatenate(
         [
-            jnp.atleast_1d(2 * numbers[name] - minimum - maximum) / ((maximum - minimum) or 1.0)
-            for name, (minimum, maximum) in _bounds(world, randomization).items()
+            jnp.atleast_1d(2 * getattr(draw, name) - minimum - maximum) / ((maximum - minimum) or 1.0)
+            for name, (minimum, maximum) in _bounds(world).items()
         ]
     )
 
@@ -83,7 +78,7 @@ def drawn_fractions(draw: Draw, world: WorldConfig, randomization: Randomization
 _OF_JOINTS, _TICKS = ("link_mass", "friction", "gain", "bias"), ("observation_delay", "action_delay")
 
 
-def _bounds(world: WorldConfig, randomization: RandomizationConfig) -> dict[str, Sequence[float]]:
+def _bounds(world: WorldConfig) -> dict[str, Sequence[float]]:
     """Minimum and maximum of each number of a `Draw`, in the order of their random keys."""
     return {
         "link_mass": world.link_mass,
@@ -95,8 +90,6 @@ def _bounds(world: WorldConfig, randomization: RandomizationConfig) -> dict[str,
         "bias": (-world.position_bias, world.position_bias),
         "observation_delay": world.observation_delay,
         "action_delay": world.action_delay,
-        "mass": randomization.mass,
-        "damping": randomization.damping,
     }
 
 
@@ -122,14 +115,11 @@ class Plant:
     def episode(self, draw: Draw) -> Episode:
         """The arm of an episode."""
         payload, lever = draw.payload, draw.payload_lever
-        factors = jnp.concatenate(
-            [draw.load.mass * draw.link_mass, jnp.stack([payload, payload * lever, payload * lever**2])]
-        )
+        factors = jnp.concatenate([draw.link_mass, jnp.stack([payload, payload * lever, payload * lever**2])])
         # Elementwise: matrix products are of lower precision on GPUs.
         moments = jnp.sum(factors[:, None, None] * jnp.asarray(self.moments, factors.dtype), axis=0)
         numbers = jnp.asarray(self.numbers, factors.dtype)
-        damping = draw.load.damping * numbers[:, 13]
-        numbers = numbers.at[:, 5:12].set(moments).at[:, 13].set(damping).at[:, 12].add(PERIOD * damping)
+        numbers = numbers.at[:, 5:12].set(moments).at[:, 12].add(PERIOD * numbers[:, 13])
         return Episode(
             numbers=numbers.ravel(),
             base=GRAVITY * draw.gravity_error * jnp.asarray(self.upward, factors.dtype),

@@ -1,12 +1,12 @@
 """Simulation of the learner, from torques to joint states: by MJX, or by mimic's own dynamics in a fused kernel."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Float
+from jaxtyping import Array
 from mujoco import mjx
 
 from mimic.arms.embodiment import LONG
@@ -19,18 +19,6 @@ from mimic.physics.world import AUTO
 _LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest by measurement
 
 
-class Load(NamedTuple):
-    """Factors on the parameters of an arm's model.
-
-    Attributes:
-      mass: factor on the masses and inertias of its bodies.
-      damping: factor on the damping of its joints.
-    """
-
-    mass: Float[Array, ""] | float = 1.0
-    damping: Float[Array, ""] | float = 1.0
-
-
 class PhysicsChoice(NamedTuple):
     """The physics that simulates an arm: "mjx" or "fused", and why."""
 
@@ -38,7 +26,7 @@ class PhysicsChoice(NamedTuple):
     reason: str
 
 
-Advance = Callable[[Array, Array, Array, Load], tuple[Array, Array]]
+Advance = Callable[[Array, Array, Array], tuple[Array, Array]]
 
 
 def choose_physics(physics: str, model: mujoco.MjModel) -> PhysicsChoice:
@@ -61,7 +49,7 @@ def choose_physics(physics: str, model: mujoco.MjModel) -> PhysicsChoice:
 
 
 def make_advance(model: mujoco.MjModel, timestep: float, substeps: int, physics: str = "mjx") -> Advance:
-    """Makes a function (qpos, qvel, torque, load) -> (qpos, qvel) of `substeps` steps with a constant torque.
+    """Makes a function (qpos, qvel, torque) -> (qpos, qvel) of `substeps` steps with a constant torque.
 
     It integrates the forward dynamics by the classical fourth-order Runge-Kutta method, as MuJoCo's RK4 does.
 
@@ -79,18 +67,13 @@ def _mjx_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advan
     device = jax.local_devices()[0]  # MJX would choose a device of process 0, which other processes cannot use
     constants = jax.device_get((mjx.put_model(model, device=device), mjx.make_data(model, device=device)))
 
-    def advance(qpos: Array, qvel: Array, torque: Array, load: Load) -> tuple[Array, Array]:
+    def advance(qpos: Array, qvel: Array, torque: Array) -> tuple[Array, Array]:
         mjx_model, blank = jax.tree.map(constant, constants)
-        loaded = mjx_model.replace(
-            body_mass=load.mass * mjx_model.body_mass,
-            body_inertia=load.mass * mjx_model.body_inertia,
-            dof_damping=load.damping * mjx_model.dof_damping,
-        )
 
         def acceleration(qpos: Array, qvel: Array) -> Array:
             # `Data` is not carried from step to step: a step needs only its joint state.
             data = blank.replace(qpos=qpos, qvel=qvel, qfrc_applied=torque)
-            return mjx.forward(loaded, data).qacc
+            return mjx.forward(mjx_model, data).qacc
 
         return runge_kutta(acceleration, qpos, qvel, timestep, substeps)
 
@@ -105,11 +88,9 @@ def constant(value: Any) -> Array:
 def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advance:
     joints = joints_of_model(model)
 
-    def plain(qpos: Array, qvel: Array, torque: Array, load: Array) -> tuple[Array, Array]:
-        of_arm, force = _loaded(joints, list(torque), *load)
-
+    def plain(qpos: Array, qvel: Array, torque: Array) -> tuple[Array, Array]:
         def acceleration(qpos: Array, qvel: Array) -> Array:
-            return jnp.stack(dynamics.acceleration(of_arm, list(qpos), list(qvel), force))
+            return jnp.stack(dynamics.acceleration(joints, list(qpos), list(qvel), list(torque)))
 
         return runge_kutta(acceleration, qpos, qvel, timestep, substeps)
 
@@ -117,29 +98,19 @@ def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Adv
     widths = len(joints), len(joints)
     step = fused_kernel.fused(_scalar_step(joints, timestep, substeps), widths, plain=plain, launch=_LAUNCH)
 
-    def advance(qpos: Array, qvel: Array, torque: Array, load: Load) -> tuple[Array, Array]:
-        qpos, qvel = step(qpos, qvel, torque, jnp.stack([jnp.asarray(x, qpos.dtype) for x in load]))
+    def advance(qpos: Array, qvel: Array, torque: Array) -> tuple[Array, Array]:
+        qpos, qvel = step(qpos, qvel, torque)
         return qpos, qvel
 
     return advance
 
 
-def _loaded(
-    joints: tuple[JointNumbers, ...], torque: Sequence[Any], mass: Any, damping: Any
-) -> tuple[list[JointNumbers], list[Any]]:
-    """Joints and torques over the factor on masses."""
-    inverse = 1.0 / mass
-    return dynamics.loaded(joints, mass, damping), [inverse * x for x in torque]
-
-
 def _scalar_step(joints: tuple[JointNumbers, ...], timestep: float, substeps: int) -> fused_kernel.ScalarFunction:
     """The steps on scalar components, for the kernel."""
 
-    def step(qpos: Any, qvel: Any, torque: Any, load: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        of_arm, force = _loaded(joints, torque, *load)
-
+    def step(qpos: Any, qvel: Any, torque: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         def acceleration(qpos: Any, qvel: Any) -> tuple[Any, ...]:
-            return dynamics.acceleration(of_arm, qpos, qvel, force, trigonometry=cosine_and_sine)
+            return dynamics.acceleration(joints, qpos, qvel, torque, trigonometry=cosine_and_sine)
 
         return runge_kutta(acceleration, tuple(qpos), tuple(qvel), timestep, substeps)
 

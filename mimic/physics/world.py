@@ -17,27 +17,6 @@ def _interval(minimum: float, maximum: float, *, at_least: float, at_most: float
 
 
 @dataclasses.dataclass(frozen=True)
-class RandomizationConfig:
-    """Randomization of the learner's dynamics, drawn at the start of each episode; a range of zero width is constant.
-
-    Attributes:
-      mass: minimum and maximum factor on the masses and inertias of the learner's bodies.
-      damping: minimum and maximum factor on the damping of its joints.
-    """
-
-    # Beyond these factors the arm is another one, and float32 no longer simulates it.
-    mass: list[float] = number(lambda: [1.0, 1.0], at_least=1e-3, at_most=1e3, entries=(2, 2))
-    damping: list[float] = number(lambda: [1.0, 1.0], at_least=1e-3, at_most=1e3, entries=(2, 2))
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "randomization.")
-        for name in ("mass", "damping"):
-            minimum, maximum = getattr(self, name)
-            if minimum > maximum:
-                raise ValueError(f"randomization.{name}: expected [minimum, maximum], got [{minimum}, {maximum}]")
-
-
-@dataclasses.dataclass(frozen=True)
 class WorldConfig:
     """Gravity, friction, load, sensors and delays. Ranges are drawn from uniformly at the start of each episode.
 

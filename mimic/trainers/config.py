@@ -200,7 +200,7 @@ class PPOConfig(TrainerConfig):
 # Fields of an environment that a mapper does not use: it maps poses and simulates nothing.
 _NOT_OF_MAPPERS = (
     *("demonstrations", "horizon", "preview", "reward", "observation", "limit_weight"),
-    *("control_dt", "substeps", "physics", "randomization", "action_scale"),
+    *("control_dt", "substeps", "physics", "action_scale"),
 )
 MAPPER_INPUTS, MAPPER_OUTPUTS, ACTIVATIONS = ("angles", "link_states"), ("tanh", "circle"), ("leaky_relu", "gelu")
 

@@ -24,7 +24,7 @@ from mimic.trainers.config import PPOConfig, TrainConfig, trainer_config
 from mimic.trainers.run_models import MODELS, with_original_models, with_saved_models
 
 _OF_NETWORKS = (  # keys on which the sizes of a run's networks depend
-    *("env.expert.", "env.learner.", "env.arms", "env.world", "env.randomization.", "env.control", "env.preview"),
+    *("env.expert.", "env.learner.", "env.arms", "env.world", "env.control", "env.preview"),
     *("env.observation.", "env.environment", "env.metric.links", "env.metric.hand_"),
     *("trainer.name", "trainer.network", "trainer.hidden_layers", "trainer.privileged_critic"),
 )

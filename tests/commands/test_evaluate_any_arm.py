@@ -37,7 +37,6 @@ def config_alone(tmp_path_factory):
             ["controller=pd"],
             "controller: expected policy or nearest_pose for all arms of a run of many, got pd; choose",
         ),
-        (["mass=1.2"], "randomization: expected the default where the learner is drawn for each episode, got mass="),
         (["locked=[2]"], "locked: expected with learner=NAME, as in learner=panda locked=[2,4], got [2]"),
         (["learner=panda_pair"], "panda_pair: expected a serial arm, got a tree of 2 chains"),
     ],
@@ -77,7 +76,7 @@ def test_one_arm_has_the_report_of_a_run_of_one_learner(run_dir, tmp_path):
     assert report["evaluated"]["learner"] == "panda" and report["evaluated"]["locked"] == [2]
     assert report["mjx"]["mean_distance"] == pytest.approx(report["mean_distance"], rel=1e-3)
     assert len((out / "demonstrations.csv").read_text().splitlines()) == 1 + sum(FAMILY["demonstrations"].values())
-    prepare_evaluation(EvaluateConfig(str(run_dir), controller="hold", mass=1.2, **options), 0.0)()
+    prepare_evaluation(EvaluateConfig(str(run_dir), controller="hold", **options), 0.0)()
 
 
 @pytest.mark.slow

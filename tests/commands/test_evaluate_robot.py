@@ -212,7 +212,7 @@ def test_tracking_is_the_same_on_a_virtual_robot_as_in_the_environment(tmp_path)
         (["robot=virtual_panda", "robot_loop=mars"], "robot_loop: expected one of mimic, ruckig"),
         (["robot=virtual_panda", "robot_world=mars"], "robot_world: expected one of nominal, hardware"),
         (["robot=virtual_panda", "controller=pd"], "controller: expected policy or tracking with robot=, got pd"),
-        (["robot=virtual_panda", "mass=1.2"], "expected none with robot="),
+        (["robot=virtual_panda", "physics=mjx"], "expected none with robot="),
         (["robot=virtual_panda", "episodes=0"], "episodes: expected a whole number from 1"),
     ],
 )

@@ -155,9 +155,9 @@ def test_demonstrations(said, tmp_path):
 def test_train_and_evaluate(said, tmp_path):
     gap = json.loads((tmp_path / "run" / "report.json").read_text())["optimality_gap"]
     assert gap["train"] < 0.3  # it learns: the start is at 1.8
-    pattern = r"held-out gap: (\S+)% after training, (\S+)% from the checkpoint, (\S+)% with 20 % more mass"
-    ((trained, again, heavier),) = re.findall(pattern, said)
-    assert trained == again != heavier
+    pattern = r"held-out gap: (\S+)% after training, (\S+)% from the checkpoint, (\S+)% of PD control"
+    ((trained, again, controlled),) = re.findall(pattern, said)
+    assert trained == again != controlled
     assert float(trained) / 100 == pytest.approx(gap["held_out"], abs=1e-4)
     assert (tmp_path / "policy.mp4").stat().st_size > 10_000
 

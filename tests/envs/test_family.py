@@ -55,7 +55,6 @@ def test_arms_are_named_by_their_files(tmp_path):
     [
         ({"physics": "mjx"}, "physics: expected auto or fused where the learner is drawn for each episode, got mjx"),
         ({"preview": 2}, "preview: expected 1 where .*, got 2"),
-        ({"randomization": {"mass": [0.5, 2]}}, r"randomization: expected the default where .*, got mass=\[0.5, 2.0\]"),
         (
             {"reward": {"terms": {"self_collision": 1.0}}},
             "reward: expected the default where .*, got terms=.*self_coll",

@@ -12,7 +12,6 @@ from mimic.arms.arm import torque_scale as scale_of_one_arm
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
 from mimic.envs import many_arms_control as control
 from mimic.physics.composite_kernel import make_advance
-from mimic.physics.step import Load
 from mimic.retargeting.array_nearest import NearestPose
 
 DT = 0.1
@@ -52,7 +51,7 @@ def test_targets_of_a_constant_acceleration_are_reached(x64, panda, mask):
     qvel, qacc = 0.3 * qvel, 3.0 * qacc
     targets = targets_at(qpos + DT * qvel + 0.5 * DT**2 * qacc, qvel + DT * qacc)
     torque = tracking_torque(arm, qpos, qvel, targets, UNLIMITED)
-    end = make_advance(DT / 10, 10)(arm, qpos, qvel, torque, Load())
+    end = make_advance(DT / 10, 10)(arm, qpos, qvel, torque)
     np.testing.assert_allclose(end[0], targets.qpos, rtol=0, atol=2e-3)
     np.testing.assert_allclose(end[1], targets.qvel, rtol=0, atol=4e-2)
 
@@ -78,7 +77,7 @@ def test_far_targets_are_approached_at_the_velocity_limit_and_braked_before(x64,
     angles, speeds = [], []
     for _ in range(25):
         torque = tracking_torque(arm, qpos, qvel, target, control.torque_scale(arm, 1.0, DT))
-        qpos, qvel = advance(arm, qpos, qvel, torque, Load())
+        qpos, qvel = advance(arm, qpos, qvel, torque)
         angles.append(float(qpos[1]))
         speeds.append(float(qvel[1]))
     assert max(speeds) < 1.5 * panda.velocity_limit[1] and max(speeds) > 0.7 * panda.velocity_limit[1]

@@ -1,6 +1,5 @@
 """Random serial arms with random masses, their arrays, and their accelerations by C MuJoCo."""
 
-import copy
 from typing import Any
 
 import jax.numpy as jnp
@@ -63,26 +62,16 @@ def acceleration(model, qpos, qvel, torque):
     return data.qacc.copy()
 
 
-def loaded(model, mass, damping):
-    """A copy of a model with factors of all masses, inertias and dampings."""
-    heavier = copy.copy(model)
-    heavier.body_mass[:] *= mass
-    heavier.body_inertia[:] *= mass
-    heavier.dof_damping[:] *= damping
-    mujoco.mj_setConst(heavier, mujoco.MjData(heavier))
-    return heavier
-
-
-def looped(arm, qpos, qvel, torque, mass: Any = 1.0, damping: Any = 1.0, base: Any = None):
+def looped(arm, qpos, qvel, torque, base: Any = None):
     """Accelerations of an arm by the equations for CPUs."""
     numbers = joint_numbers(arm).reshape(MAX_JOINTS, NUMBERS)
-    return looped_dynamics.acceleration(numbers, qpos, qvel, torque, jnp.asarray(mass), jnp.asarray(damping), base)
+    return looped_dynamics.acceleration(numbers, qpos, qvel, torque, base)
 
 
-def unrolled(arm, qpos, qvel, torque, mass: Any = 1.0, damping: Any = 1.0, base: Any = None):
+def unrolled(arm, qpos, qvel, torque, base: Any = None):
     """Accelerations of an arm by the equations of the GPU kernel."""
-    joints = dynamics.loaded(unpacked(joint_numbers(arm)), mass, damping)
-    state = tuple(qpos), tuple(qvel), tuple(torque / mass)
+    joints = dynamics.with_locks(unpacked(joint_numbers(arm)))
+    state = tuple(qpos), tuple(qvel), tuple(torque)
     return jnp.stack(dynamics.acceleration(joints, *state, base, cosine_and_sine))
 
 

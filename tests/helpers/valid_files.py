@@ -86,7 +86,7 @@ def write_command_lines(folder: Path) -> None:
         "train": f"{small} env.learner.locked={{joint1:0.1}} metric=paper env.world=ideal run_dir=run -m --cfg=job",
         "train_ppo": f"{small} trainer=ppo trainer.num_envs=64 trainer.hidden_layers=[8,8] trainer.entropy_cost=0.01",
         "train_mapper": f"{small} trainer=pose_mapper trainer.samples=64 trainer.epochs=2 trainer.learning_rate=1e-3",
-        "evaluate": "run=run checkpoint=3 controller=policy physics=mjx mass=1.1 out=out",
+        "evaluate": "run=run checkpoint=3 controller=policy physics=mjx out=out",
         "render": "run=run demonstration=1 split=train",
         "retarget": "source=d.npz learner=planar4dof limits=none hand=scaled out=o seed=1",
         "demonstrations": "env=planar4dof count=3 source=m.csv joints=[a,b] capture.cutoff=6 out=d.npz",

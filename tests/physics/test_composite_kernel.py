@@ -9,7 +9,6 @@ from mimic.arms.arrays import MAX_JOINTS, lock_joints
 from mimic.base.fused_kernel import LaunchConfig
 from mimic.physics.composite_kernel import gpu_kernel, make_advance
 from mimic.physics.joint_numbers import joint_numbers
-from mimic.physics.step import Load
 from mimic.physics.trigonometry import cosine_and_sine
 from tests.helpers.array_cases import Batch, random_source
 
@@ -20,22 +19,21 @@ LAUNCH = LaunchConfig(block=32, warps=1)
 
 @pytest.fixture(scope="module")
 def batch():
-    """Random arms of 1 to 8 joints, a third of which are locked, in light motion, and the load of each."""
+    """Random arms of 1 to 8 joints, a third of which are locked, in light motion."""
     with jax.enable_x64(True):
         batch, rng = Batch([random_source(seed) for seed in range(COUNT)]), np.random.default_rng(0)
         arms = jax.vmap(lock_joints)(batch.arrays, rng.random((COUNT, MAX_JOINTS)) < 1 / 3)
         arms = jax.tree.map(np.asarray, arms)
         is_free = arms.is_free
-        torque, load = rng.normal(size=(COUNT, MAX_JOINTS)), rng.uniform(0.5, 2, (2, COUNT))
-        return arms, batch.qpos, 0.3 * batch.qvel * is_free, 0.3 * torque, Load(*load)
+        return arms, batch.qpos, 0.3 * batch.qvel * is_free, 0.3 * rng.normal(size=(COUNT, MAX_JOINTS))
 
 
 @pytest.mark.slow
 def test_the_kernel_equals_the_looped_form(x64, interpreted, batch):
-    arms, qpos, qvel, torque, load = batch
+    arms, qpos, qvel, torque = batch
     assert (np.asarray(arms.is_free).sum(axis=1) < MAX_JOINTS).any() and (arms.is_free[:, 0] == 0).any()
     kernel = jax.jit(gpu_kernel(TIMESTEP, SUBSTEPS, launch=LAUNCH))
-    actual = kernel(jax.vmap(joint_numbers)(arms), *map(jnp.asarray, (qpos, qvel, torque)), np.stack(load, 1))
+    actual = kernel(jax.vmap(joint_numbers)(arms), *map(jnp.asarray, (qpos, qvel, torque)))
     expected = jax.jit(jax.vmap(make_advance(TIMESTEP, SUBSTEPS)))(*batch)
     for values, reference in zip(actual, expected, strict=True):
         scale = 1 + np.abs(reference).max(axis=1, keepdims=True)

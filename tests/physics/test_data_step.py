@@ -11,7 +11,6 @@ import pytest
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, stack_arms
 from mimic.physics.composite_kernel import make_advance
-from mimic.physics.step import Load
 
 TIMESTEP, SUBSTEPS, COUNT = 0.01, 10, 5
 ARMS = {
@@ -31,10 +30,6 @@ def random_states(joints, dtype: Any = np.float64):
     return (factors * rng.uniform(-1, 1, (3, COUNT, joints))).astype(dtype)
 
 
-def loads(dtype: Any = np.float64):
-    return Load(jnp.linspace(0.8, 1.2, COUNT, dtype=dtype), jnp.linspace(1.5, 0.5, COUNT, dtype=dtype))
-
-
 def copies(arm, count=COUNT):
     return stack_arms([arm] * count)
 
@@ -47,7 +42,7 @@ def mixed():
     arms += [arm_arrays(build_arm(ArmConfig(model="planar", link_lengths=[0.5, 0.5])))]
     arms = stack_arms(arms).astype(np.float32)
     qpos, qvel, torque = random_states(MAX_JOINTS, np.float32)
-    return arms, qpos, qvel * arms.is_free, torque, loads(np.float32)
+    return arms, qpos, qvel * arms.is_free, torque
 
 
 def test_a_batch_steps_as_each_of_its_arms(mixed):
@@ -68,11 +63,11 @@ def test_locked_joints_and_empty_slots_rest_at_their_angle(mixed):
 
 
 def test_some_arguments_may_be_common_to_the_batch(mixed):
-    arms, qpos, qvel, torque, _ = mixed
+    arms, qpos, qvel, torque = mixed
     advance = make_advance(TIMESTEP, SUBSTEPS)
     arm, state = jax.tree.map(lambda x: x[0], arms), (qpos, qvel * arms.is_free[0])
-    common = jax.jit(jax.vmap(advance, (None, 0, 0, None, None)))(arm, *state, torque[0], Load())
-    each = ADVANCE(copies(arm), *state, np.tile(torque[:1], (COUNT, 1)), Load(*jnp.ones((2, COUNT), jnp.float32)))
+    common = jax.jit(jax.vmap(advance, (None, 0, 0, None)))(arm, *state, torque[0])
+    each = ADVANCE(copies(arm), *state, np.tile(torque[:1], (COUNT, 1)))
     for a, b in zip(common, each, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -101,7 +96,7 @@ def test_gradients_are_finite_and_those_of_finite_differences(x64, mixed):
     def moved(sign):
         torque, damping = arguments[3] + sign * step * d_torque, arms.damping + sign * step * d_damping
         changed = dataclasses.replace(arms, damping=damping)
-        return value_and_gradient((changed, *arguments[1:3], torque, arguments[4]))[0]
+        return value_and_gradient((changed, *arguments[1:3], torque))[0]
 
     d_torque, d_damping = rng.normal(size=(2, COUNT, MAX_JOINTS))
     expected = (moved(1) - moved(-1)) / (2 * step)

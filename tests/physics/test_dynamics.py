@@ -16,7 +16,6 @@ from tests.helpers.array_cases import (
     Batch,
     acceleration,
     assert_near,
-    loaded,
     looped,
     padded,
     random_source,
@@ -92,17 +91,6 @@ def test_a_lock_mask_of_the_panda_is_the_model_without_these_joints(x64):
         assert not actual[:, :7][~np.stack(free)].any() and not actual[:, 7:].any()
 
 
-@pytest.mark.slow
-def test_load_scales_masses_inertias_and_damping(x64, batch):
-    mass, damping = 1.2, 0.8
-    factors = np.full(COUNT, mass), np.full(COUNT, damping)
-    forms = both_forms(batch.arrays, batch.qpos, batch.qvel, batch.torque, *factors)
-    for *rows, arm, (qpos, qvel, _, force) in zip(*forms.values(), batch.arms, batch.motions, strict=True):
-        expected = padded(acceleration(loaded(arm.model, mass, damping), qpos, qvel, force))
-        for row in rows:
-            assert_near(row, expected)
-
-
 def test_a_locked_joint_without_inertia_is_harmless(x64):
     """The pivot of a free one would be 0, as in MuJoCo."""
     arm = arm_arrays(build_arm(ArmConfig()))
@@ -123,6 +111,6 @@ def test_the_inverse_holds_on_an_accelerated_base(x64):
     qpos, qvel, qacc = (list(jnp.asarray(rng.normal(size=7))) for _ in range(3))
     base = (0.3, -2.0, 9.0)
     torque = dynamics.inverse(joints, qpos, qvel, qacc, base)
-    forward = dynamics.acceleration(dynamics.loaded(joints, 1.0, 1.0), qpos, qvel, torque, base)
+    forward = dynamics.acceleration(joints, qpos, qvel, torque, base)
     np.testing.assert_allclose(forward, qacc, rtol=1e-9)
     assert np.abs(np.subtract(torque, dynamics.inverse(joints, qpos, qvel, qacc))).max() > 1  # weight of the arm

@@ -17,7 +17,6 @@ from mimic.envs import env_config
 from mimic.envs.world_env import plant_of
 from mimic.physics.inner_loop import LoopState, flattened, gpu_kernel, make_inner_loop
 from mimic.physics.plant import GRAVITY, Draw, end_of_last_link
-from mimic.physics.step import Load
 from tests.helpers.lowering import gpu_program
 
 PERIODS = 50
@@ -48,19 +47,17 @@ def draw_for(joints: int, seed: int = 0) -> Draw:
         bias=jnp.asarray(rng.uniform(-0.01, 0.01, joints)),
         observation_delay=jnp.asarray(0),
         action_delay=jnp.asarray(0),
-        load=Load(jnp.asarray(1.1), jnp.asarray(1.3)),
     )
 
 
 def mujoco_model(arm, draw: Draw) -> mujoco.MjModel:
     """The arm of a draw in C MuJoCo, with its payload as part of the last body."""
     model = copy.copy(arm.model)
-    factors = np.asarray(draw.link_mass) * float(draw.load.mass)
+    factors = np.asarray(draw.link_mass)
     last, moving = model.nbody - 1, np.unique(model.jnt_bodyid)
     assert len(moving) == len(factors)
     model.body_mass[moving] *= factors
     model.body_inertia[moving] *= factors[:, None]
-    model.dof_damping[:] *= float(draw.load.damping)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     tip, along = end_of_last_link(arm)  # the base frame of these arms is the world

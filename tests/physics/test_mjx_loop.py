@@ -45,9 +45,7 @@ def case():
         "payload": jnp.zeros(()),
         "payload_lever": jnp.zeros(()),
     }
-    draw = dataclasses.replace(
-        draw, **nominal, gravity_error=jnp.zeros(()), load=type(draw.load)(jnp.ones(()), jnp.ones(()))
-    )
+    draw = dataclasses.replace(draw, **nominal, gravity_error=jnp.zeros(()))
     draw = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), draw)
     return arm, plant, world, draw, jax.jit(make_mjx_loop("torque", plant, world, PERIODS))
 

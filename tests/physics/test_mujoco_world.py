@@ -23,12 +23,11 @@ TILTED = """<mujoco><worldbody><body name="base" pos="1 2 3" quat="0.9 0.3 0.1 0
 
 def loaded(world, draw) -> mujoco.MjModel:
     """The model of an episode in C MuJoCo."""
-    model, mass = copy.copy(world.model), np.asarray(draw.load.mass) * np.asarray(draw.link_mass)
+    model, mass = copy.copy(world.model), np.asarray(draw.link_mass)
     error, payload, lever = (float(x) for x in (draw.gravity_error, draw.payload, draw.payload_lever))
     fields = loaded_fields(world, error, mass, payload, lever, np)
     model.opt.gravity[:] = fields.gravity
     model.body_mass[:], model.body_inertia[:], model.body_ipos[:] = fields[1:]
-    model.dof_damping[:] *= float(draw.load.damping)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 

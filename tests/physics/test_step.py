@@ -12,13 +12,12 @@ from mimic.arms.simulation_model import simulation_model
 from mimic.base import fused_kernel
 from mimic.physics import dynamics
 from mimic.physics.joint_numbers import joints_of_model
-from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
-from tests.helpers.array_cases import acceleration, assert_near, loaded
+from mimic.physics.step import PhysicsChoice, choose_physics, make_advance
+from tests.helpers.array_cases import acceleration, assert_near
 from tests.helpers.lowering import gpu_program
 from tests.helpers.random_arms import SEEDS, random_arm
 from tests.helpers.trees import torso
 
-LOAD = Load(mass=1.2, damping=0.8)
 ARMS = {
     "panda7": ArmConfig(),
     "panda4": ArmConfig(locked=[3, 6, 7]),
@@ -58,10 +57,10 @@ def mujoco_acceleration(model, qpos, qvel, torque):
     return np.array([acceleration(model, *row) for row in zip(qpos, qvel, torque, strict=True)])
 
 
-def ours(function, model, *rows, mass=1.0, damping=1.0):
-    """A function of `dynamics` on arrays [count, joints]; where a load is given, its torques are over the mass."""
+def ours(function, model, *rows):
+    """A function of `dynamics` on arrays [count, joints]."""
     columns = ([jnp.asarray(column) for column in row.T] for row in rows)
-    return np.stack(function(dynamics.loaded(joints_of_model(model), mass, damping), *columns), axis=-1)
+    return np.stack(function(joints_of_model(model), *columns), axis=-1)
 
 
 def original_and_simulated(name):
@@ -197,19 +196,18 @@ def test_locked_arms_accelerate_as_the_whole_arm_with_joints_held(x64, make, arg
 
 
 @pytest.mark.parametrize("kind", ["mjx", "fused"])
-def test_both_physics_step_a_loaded_arm_as_mujoco_does(x64, kind):
+def test_both_physics_step_as_mujoco_does(x64, kind):
     """Three steps of RK4 in double precision: the same formula, in another order."""
     model, timestep, substeps = build_arm(ARMS["planar"]).model, 0.01, 3
-    heavier = loaded(model, LOAD.mass, LOAD.damping)
-    heavier.opt.timestep = timestep
+    model.opt.timestep = timestep
     qpos, qvel, torque = random_states(model)
     advance = make_advance(model, timestep, substeps, kind)
     state, empty = tuple(map(jnp.asarray, (qpos, qvel, torque))), np.zeros((0, 3), np.float32)
-    steps = jax.jit(jax.vmap(lambda a, b, c: advance(a, b, c, LOAD)))
+    steps = jax.jit(jax.vmap(advance))
     actual = steps(*state)
-    data, expected = mujoco.MjData(heavier), []
+    data, expected = mujoco.MjData(model), []
     for data.qpos[:], data.qvel[:], data.qfrc_applied[:] in zip(qpos, qvel, torque, strict=True):
-        mujoco.mj_step(heavier, data, substeps)
+        mujoco.mj_step(model, data, substeps)
         expected.append((data.qpos.copy(), data.qvel.copy()))
     for values, reference in zip(actual, np.swapaxes(expected, 0, 1), strict=True):
         assert_near(np.asarray(values), reference)
@@ -220,20 +218,18 @@ def test_both_physics_step_a_loaded_arm_as_mujoco_does(x64, kind):
 
 @pytest.fixture(scope="module")
 def planar():
-    """A small arm that compiles quickly, with 5 states and 5 loads."""
+    """A small arm that compiles quickly, with 5 states."""
     model = build_arm(ARMS["planar"]).model
-    states = [jnp.asarray(x, jnp.float32) for x in random_states(model, count=5)]
-    loads = Load(jnp.linspace(0.8, 1.2, 5), jnp.linspace(1.5, 0.5, 5))
-    return model, states, loads
+    return model, [jnp.asarray(x, jnp.float32) for x in random_states(model, count=5)]
 
 
 def test_a_batch_steps_as_each_of_its_arms(planar):
-    model, states, loads = planar
+    model, states = planar
     advance = make_advance(model, 0.01, 2, "fused")
-    together = jax.jit(jax.vmap(advance))(*states, loads)
+    together = jax.jit(jax.vmap(advance))(*states)
     alone = jax.jit(advance)
     for i in range(5):
-        one = alone(*(x[i] for x in states), Load(*(x[i] for x in loads)))
+        one = alone(*(x[i] for x in states))
         for batched, single in zip(together, one, strict=True):
             np.testing.assert_allclose(batched[i], single, atol=1e-5)  # rounding of velocities up to 10 rad/s
 
@@ -241,22 +237,22 @@ def test_a_batch_steps_as_each_of_its_arms(planar):
 def test_the_kernel_steps_as_the_plain_function_does(planar, gpu_kernels):
     """The GPU kernel, interpreted on the CPU, for a batch that is no multiple of its block."""
     count = fused_kernel.DEFAULT.block + 1
-    model, states, loads = planar
+    model, states = planar
     advance = make_advance(model, 0.01, 2, "fused")
-    rows = [jnp.resize(x, (count, *x.shape[1:])) for x in (*states, *loads)]
-    batch = jax.jit(jax.vmap(advance))(*rows[:3], Load(*rows[3:]))
+    rows = [jnp.resize(x, (count, *x.shape[1:])) for x in states]
+    batch = jax.jit(jax.vmap(advance))(*rows)
     assert len(gpu_kernels) == 1
     alone = jax.jit(advance)
-    expected = [alone(*(x[i] for x in states), Load(*(x[i] for x in loads))) for i in range(5)]
+    expected = [alone(*(x[i] for x in states)) for i in range(5)]
     for index, values in enumerate(batch):
         reference = np.stack([one[index] for one in expected])
         np.testing.assert_allclose(values, np.resize(reference, (count, 3)), atol=1e-5)  # as above
 
 
 def test_the_kernel_lowers_without_a_gpu(planar):
-    model, states, _ = planar
+    model, states = planar
     advance = make_advance(model, 0.01, 2, "fused")
-    batched = jax.jit(jax.vmap(lambda a, b, c: advance(a, b, c, Load())))
+    batched = jax.jit(jax.vmap(advance))
     assert "triton" in gpu_program(batched, *states)
     assert "triton" not in batched.lower(*states).as_text()
 
@@ -275,7 +271,7 @@ def test_default_substeps_keep_the_tip_within_1_mm():
     def final(held):
         def step(state, torque):
             qpos, qvel = state
-            return advance(qpos, qvel, torque, Load()), None
+            return advance(qpos, qvel, torque), None
 
         return jax.lax.scan(step, (home, jnp.zeros_like(home)), held)[0][0]
 
