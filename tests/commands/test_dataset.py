@@ -108,8 +108,7 @@ def test_a_split_of_a_run(run_dir, written, tmp_path):
         np.testing.assert_array_equal(held_out[name], both[name][COUNT:])
 
 
-def test_demonstrations_come_back_from_a_dataset(recorded, tmp_path, monkeypatch):
-    monkeypatch.setattr("mimic.commands.demonstrations.plot_demonstrations", lambda *_, **__: None)
+def test_demonstrations_come_back_from_a_dataset(recorded, tmp_path):
     dataset = write(tmp_path / "set", demonstrations=str(recorded))
     text = run("demonstrations", f"source={dataset}", f"out={tmp_path / 'back.npz'}")
     assert (
