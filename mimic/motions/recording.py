@@ -19,6 +19,7 @@ from mimic.motions.demonstrations import Demonstrations
 from mimic.motions.experts import KINDS, MIXED, Law, inverse_dynamics, kind_of, make_expert
 
 _MAX_DRAWS = 100
+_THREADS = 4  # at most; on 16 cores 16 threads take 1.4 times as long, because they wait for the GIL
 _TEST = 1  # of `numpy.random.SeedSequence`: no other set has this spawn key
 
 
@@ -78,7 +79,7 @@ def record_demonstrations(
         return _recording(arm, kinds[index], np.random.default_rng(entropy), horizon, dt, substeps, limits)
 
     recordings = []
-    with ThreadPoolExecutor(os.cpu_count()) as executor:  # MuJoCo releases the GIL while it steps
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as executor:  # MuJoCo releases the GIL while it steps
         for recording, redrawn in executor.map(record, range(count)):
             recordings.append(recording)
             on_recorded(redrawn)
