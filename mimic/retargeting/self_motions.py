@@ -19,7 +19,7 @@ from mimic.retargeting.hand_target import POSITION_TOLERANCE, ROTATION_TOLERANCE
 from mimic.retargeting.pose import wrap_angles
 
 _AHEAD = 32, 128  # times before those without an exact hand at which the arm may begin to leave the path
-_FRACTIONS = 1.0, 0.5  # of how far a posture may go along its curve from one time to the next
+_FRACTIONS = 1.0, 0.5  # of the part of its curve to which a posture may go from one time to the next
 _APART, _MOST = 0.25, 600  # of the maximum change, between postures that are kept; and how many are kept at most
 _CLOSE = 0.3  # of the tolerances of an exact hand, for rounding to single precision
 _MARGIN = 1 - 1e-4  # of the maximum change
@@ -133,10 +133,12 @@ def _next(arm: _Arm, target: np.ndarray, qpos: np.ndarray) -> tuple[np.ndarray, 
     change, ways = (near - qpos[origin]) / arm.jump, []
     free = np.swapaxes(np.linalg.svd(jacobian)[2][:, jacobian.shape[1] :], 0, 1)  # in which the hands stand
     for direction in np.concatenate([free, -free]):
+        # The least change may be too large for a joint that another posture of the curve moves less.
         with np.errstate(divide="ignore", invalid="ignore"):
-            room = (np.sign(direction) - change) / direction
-        room = np.clip(np.where(direction == 0, np.inf, room).min(axis=1, keepdims=True), 0, None)
-        ways += [near + fraction * room * direction * arm.jump for fraction in _FRACTIONS]
+            enter, leave = ((side * np.sign(direction) - change) / direction for side in (-1, 1))
+        enter = np.clip(np.where(direction == 0, -np.inf, enter).max(axis=1, keepdims=True), 0, None)
+        leave = np.where(direction == 0, np.inf, leave).min(axis=1, keepdims=True).clip(enter)
+        ways += [near + (enter + part * (leave - enter)) * direction * arm.jump for part in _FRACTIONS]
     spread, _, inside = _at_hand(arm, target, np.concatenate(ways))
     postures, origin = np.concatenate([near, spread]), np.tile(origin, len(ways) + 1)
     good = np.concatenate([good[usable], inside]) & np.all(np.abs(postures - qpos[origin]) <= arm.jump, axis=1)

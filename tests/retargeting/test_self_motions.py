@@ -5,7 +5,8 @@ import pytest
 
 from mimic.arms.embodiment import panda
 from mimic.arms.link_match import hand_poses
-from mimic.retargeting.self_motions import past_failing_times
+from mimic.arms.pose_limits import continuous_joints, motion_limits
+from mimic.retargeting.self_motions import _Arm, _next, past_failing_times
 
 TIMES, FAILING = 60, slice(30, 45)
 HAND = np.zeros(1, int)
@@ -66,3 +67,16 @@ def test_joints_without_a_limit_of_speed_are_searched(motion):
     path[FAILING], exact[FAILING] = motion[FAILING.start - 1], False
     found = past_failing_times(panda(), HAND, targets, path, exact, np.full(7, np.inf))
     assert errors(found, targets).max() < 1e-4
+
+
+def test_postures_of_which_the_least_change_is_too_fast_go_along_their_curve():
+    """The rest, below 10 %, are those whose curve bends within one step."""
+    arm = _Arm(panda(), HAND, JUMP, *motion_limits(panda()), continuous_joints(panda()))
+    random = np.random.default_rng(0)
+    postures = random.uniform(-2, 2, (200, 7))
+    postures[:, 3] = random.uniform(-2.5, -0.5, 200)
+    later = postures + 0.9 * JUMP * random.choice([-1, 1], postures.shape)  # reachable in time, and so are the hands
+    reached = [_next(arm, hand, qpos[None])[0] for hand, qpos in zip(hand_poses(panda(), later), postures, strict=True)]
+    assert np.mean([len(qpos) > 0 for qpos in reached]) > 0.9
+    for before, after in zip(postures, reached, strict=True):
+        assert (np.abs(after - before) <= JUMP).all()
