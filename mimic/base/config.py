@@ -1,5 +1,6 @@
 """Typed configs: frozen dataclasses as OmegaConf schemas, checks of values, and one-line error messages."""
 
+import contextlib
 import dataclasses
 import os
 import re
@@ -85,6 +86,23 @@ def _check_ranges(node: DictConfig, prefix: str = "") -> None:
             limits[key].check(name, value)
 
 
+_SCALARS = {
+    "str": "a text",
+    **dict.fromkeys(("int", "Integer"), "a whole number"),
+    **dict.fromkeys(("float", "Float"), "a number"),
+    "bool": "true or false",
+}
+_WRONG_SCALAR = re.compile(r"Value '(.*)' (?:of type '\w+' could not be converted to (\w+)|is not a valid (bool) .*)")
+
+
+def _as_written(value: str) -> str:
+    """A value as the user should have written it, if it is a whole number with a point or an exponent."""
+    with contextlib.suppress(ValueError):
+        if float(value).is_integer() and not value.lstrip("-").isdigit():
+            return f"{value}; write {int(float(value))}"
+    return repr(value)
+
+
 def explain(error: Exception) -> str:
     """Returns a config error as one line: the key, what is wrong with it, and for an unknown key the valid keys."""
     message = " ".join(str(getattr(error, "msg", None) or error).splitlines()[0].split())
@@ -96,13 +114,15 @@ def explain(error: Exception) -> str:
     of_key = f"{key}: " if key else ""
     if null := re.fullmatch(r"field '(.*)' is not Optional|Incompatible value 'None' for field of type '\w+'", message):
         return f"{null[1] or key}: expected a value, got null"
+    if wrong := _WRONG_SCALAR.fullmatch(message):
+        return f"{of_key}expected {_SCALARS[wrong[2] or wrong[3]]}, got {_as_written(wrong[1])}"
     if "is not a ListConfig" in message:
         return f"{of_key}expected a list, as in {key}=[VALUE]"
     if "DictConfig with ListConfig" in message:
         return f"{of_key}expected a list where it is one, as in [VALUE], and else keys of its own"
     if wrong_type := re.fullmatch(r"(?:Invalid type|Merge).* is not a subclass of (\w+)\. value: (.*)", message):
         fields = f"keys of its own, as in {key}.KEY=VALUE" if key else f"the fields of {wrong_type[1]}"
-        expected = {"str": "a text", "int": "an integer", "float": "a number"}.get(wrong_type[1], fields)
+        expected = _SCALARS.get(wrong_type[1], fields)
         return f"{of_key}expected {expected}, got {'null' if wrong_type[2] == 'None' else repr(wrong_type[2])[:80]}"
     return message if str(key) in message else of_key + message
 

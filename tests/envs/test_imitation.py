@@ -202,7 +202,7 @@ def test_training_and_held_out_demonstrations_differ():
     ("overrides", "message"),
     [
         ({"previw": 1}, "unknown key 'previw'; valid are"),
-        ({"preview": "x"}, "could not be converted to Integer"),
+        ({"preview": "x"}, "preview: expected a whole number, got 'x'"),
         ({"demonstrations": {"cont": 1}}, "unknown key 'demonstrations.cont'"),
         ({"limits": "soft"}, "expected one of none, hardware"),
         ({"demonstrations": {"kind": "dance"}}, "expected one of computed_torque, pid, reach, splines, steps, mixed"),

@@ -84,7 +84,7 @@ def test_a_failed_run_is_named_and_the_rest_is_kept(launcher, tmp_path, slurm):
     ("arguments", "message"),
     [
         (["-m", "env=panda5dof,panda4dof"], "unknown env 'panda5dof'; valid are"),
-        (["-m", "seed=0,one"], "could not be converted to Integer"),
+        (["-m", "seed=0,one"], "seed: expected a whole number, got 'one'"),
         (["-m", "hydra/launcher=slurm"], "unknown hydra/launcher 'slurm'; valid are basic, ray, submitit_local, submi"),
         (["hydra/launcher=submitit_local"], "expected only with a sweep; add -m"),
         (["-m", "hydra/launcher=submitit_local", "hydra.launcher.paralel=2"], "valid are _target_, parallel, gpus_per"),
