@@ -79,6 +79,8 @@ def _writer(config: ExportConfig) -> tuple[Callable[[], None], str]:
         write = prepare_controller(given_run(config.run)[0], config.checkpoint)
         return lambda: write(out), ""
     out = new_file("out", config.out)
+    if out.suffix != ".onnx":
+        raise ValueError(f"out: expected a file that ends in .onnx, got {str(out)!r}")
     if not os.access(out.parent, os.W_OK):
         raise ValueError(f"out: {str(out)!r}: the folder cannot be written to")
     _check_packages(config.format)

@@ -144,6 +144,7 @@ def mapped(tmp_path_factory):
         (["out=new.onnx", "run="], "run: expected a run directory, as in run=runs/NAME"),
         (["out=new.onnx", "run=missing"], "run: expected a run directory, which has a config.yaml, got 'missing'"),
         ([f"out={__file__}"], "exists; name a new file"),
+        (["out=new.pdf"], "out: expected a file that ends in .onnx, got 'new.pdf'"),
         (["out=no/new.onnx"], "there is no folder 'no'"),
         (["out=new.onnx", "format=tflite"], "expected one of onnx, controller, got 'tflite'"),
     ],
