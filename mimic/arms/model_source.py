@@ -77,7 +77,7 @@ def read_source(path: str | os.PathLike[str], unusable: Collection[str] = ()) ->
     """
     shown = repr(os.fspath(path))
     if not os.path.isfile(path):
-        raise ValueError(f"no MJCF or URDF file at {shown}{', which is no file' if os.path.exists(path) else ''}")
+        raise ValueError(f"no MJCF or URDF file at {shown}{', which is a folder' if os.path.isdir(path) else ''}")
     file = Path(os.path.realpath(path))
     reader = _Reader(shown, file.parent, unusable)
     try:

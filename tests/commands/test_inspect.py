@@ -80,6 +80,7 @@ def test_an_equal_arm_reaches_the_poses_of_the_expert():
     [
         (["arm.xml", "arm.xml"], "expected one argument without a key, got "),
         (["missing.xml"], "no MJCF or URDF file at '"),
+        (["."], ", which is a folder"),
         (
             ["arm.xml", "learner.locked=[shoulder]"],
             "learner.locked: unknown joint 'shoulder'; valid are pan, lift, elbow, wrist_1",
