@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -110,15 +109,13 @@ def _session(config: ViewConfig, env: EnvConfig) -> LiveSession:
 
 
 def _finish(config: ViewConfig, session: LiveSession) -> None:
-    """Ends a session, and writes what the hand drove; further data sets have numbers."""
+    """Ends a session, and writes what the hand drove."""
     session.finish()
-    first, number = Path(config.record).expanduser(), 0
-    for recorder in session.driven:
-        while os.path.lexists(folder := first.with_name(f"{first.name}-{number}") if number else first):
-            number += 1
-        recorder.write(folder)
-        print(f"view: {recorder.episodes} episodes in {folder}", flush=True)
-    if config.record and not session.driven:
+    if session.driven is not None and session.driven.episodes:
+        folder = Path(config.record).expanduser()
+        session.driven.write(folder)
+        print(f"view: {session.driven.episodes} episodes in {folder}", flush=True)
+    elif config.record:
         print("view: record: nothing was driven, as by hand=relative or the tab 'Hand'", flush=True)
 
 
