@@ -62,8 +62,11 @@ def record_demonstrations(
       on_recorded: called after each demonstration with the number of its goals that were redrawn.
 
     Raises:
-      ValueError: an unknown kind, a count, horizon or time below its minimum, or an arm whose limits allow no goal.
+      ValueError: an embodiment in place of an arm, an unknown kind, a count, horizon or time below its minimum, or an
+        arm whose limits allow no goal.
     """
+    if not isinstance(arm, Arm):  # an embodiment has no dynamics
+        raise ValueError(f"arm: expected an Arm, as of build_arm(ArmConfig()), got {type(arm).__name__}")
     check_choice("kind", kind, (*KINDS, MIXED))
     for name, value in (("count", count), ("horizon", horizon), ("substeps", substeps)):
         if value < 1:

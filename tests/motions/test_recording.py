@@ -123,3 +123,8 @@ def test_a_diverging_simulation_is_rejected(tmp_path, monkeypatch):
     unlimited = dataclasses.replace(arm.embodiment, velocity_limit=np.full(7, np.inf))
     with pytest.raises(ValueError, match="exceed its limits"):
         mimic.record_demonstrations(dataclasses.replace(arm, embodiment=unlimited), 1, dt=2.0)
+
+
+def test_an_embodiment_has_no_dynamics_to_record():
+    with pytest.raises(ValueError, match=r"arm: expected an Arm, as of build_arm\(ArmConfig\(\)\), got Embodiment"):
+        mimic.record_demonstrations(mimic.panda(), 1)
