@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mimic.motions.demonstrations import OVERSHOOT
+from mimic.motions.demonstrations import MAX_VALUE, OVERSHOOT
 from mimic.motions.formats.episodes import Motion
 from mimic.motions.resampling import angles_and_velocities
 
@@ -59,7 +59,7 @@ def cleaned(
       notes: get what is changed.
 
     Raises:
-      ValueError: less than two samples, or a part whose angles are beyond the range.
+      ValueError: less than two samples, angles that no arm has, or a part whose angles are beyond the range.
     """
     motion = _finite(name, motion, notes)
     parts = []
@@ -86,6 +86,8 @@ def _finite(name: str, motion: Motion, notes: Notes) -> Motion:
     if not kept.all():
         notes.add("samples without numbers left out", f"{np.sum(~kept)} of {len(kept)} in {name}")
         motion = motion.take(kept)
+    if (largest := float(np.abs(motion.qpos).max())) > MAX_VALUE:
+        raise ValueError(f"source: {name} has angles up to {largest:.3g} rad, which no arm has")
     if motion.qvel is not None and not np.all(np.isfinite(motion.qvel)):
         notes.add("velocities computed, since the source's are no numbers", name)
         motion = motion._replace(qvel=None)

@@ -164,3 +164,8 @@ def test_measurements_may_lie_slightly_beyond_a_range():
     assert line.startswith("slightly beyond the joint range: a of swing by 0.00")
     with pytest.raises(ValueError, match=r"a of swing is at -0.5, expected rad in \[-0.4500, 0.5000\]"):
         clean(swing(), np.array([[-0.45, 0.5], [-1, 1]]))
+
+
+def test_angles_that_no_arm_has_are_named():
+    with pytest.raises(ValueError, match="source: swing has angles up to 5e.11 rad, which no arm has"):
+        clean(swing(amplitude=5e11))
