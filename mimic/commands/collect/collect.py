@@ -130,7 +130,7 @@ def _table(groups: Sequence[SeedGroup], metric: QualityMetric) -> Table:
         table.add_column(name, justify="right", no_wrap=True)
     for group in groups:
         table.add_row(
-            *(str(group.settings[key]) for key in keys),
+            *("-" if (value := group.settings[key]) is None else str(value) for key in keys),
             str(len(group.runs)),
             *(percent(group.interval(f"{metric.key}.{split}")) for split in SPLITS),
             f"{group.interval(metric.unit).mean:,.0f}",

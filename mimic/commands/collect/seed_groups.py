@@ -110,10 +110,11 @@ def _count_distinct(settings: Sequence[dict[str, Any]], keys: Sequence[str]) -> 
 
 
 def _label(run: FinishedRun, keys: Sequence[str]) -> str:
-    """Text of these keys of a run: env.name without its key, others with the last part of their key."""
+    """Text of these keys of a run, if it has them: env.name without its key, others with the last part of their key."""
     parts = [
-        str(run.settings.get(key)) if key == "env.name" else f"{key.rpartition('.')[2]}={run.settings.get(key)}"
+        str(run.settings[key]) if key == "env.name" else f"{key.rpartition('.')[2]}={run.settings[key]}"
         for key in keys
+        if key in run.settings
     ]
     return " ".join(parts) or str(run.settings["env.name"])
 

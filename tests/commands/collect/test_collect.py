@@ -72,7 +72,7 @@ def test_runs_that_differ_in_seed_alone_are_one_group(six, capsys, monkeypatch):
     assert (six / "collected.png").stat().st_size > 10_000
 
 
-def test_evaluations_are_groups_of_their_own(tmp_path):
+def test_evaluations_are_groups_of_their_own(tmp_path, capsys):
     for seed in (0, 1):
         write_run(tmp_path / f"run{seed}", [0.1], seed=seed)
         for name in ("policy", "pd"):
@@ -83,6 +83,9 @@ def test_evaluations_are_groups_of_their_own(tmp_path):
     groups = {group["settings"]["controller"]: group for group in collected(tmp_path)["groups"]}
     assert {name: group["seeds"] for name, group in groups.items()} == {None: [0, 1], "policy": [0, 1], "pd": [0, 1]}
     assert groups["pd"]["numbers"]["optimality_gap.train"]["mean"] == pytest.approx(0.2)
+    labels = {name: group["label"] for name, group in groups.items()}
+    assert labels == {None: "planar4dof", "policy": "controller=policy", "pd": "controller=pd"}
+    assert "None" not in capsys.readouterr().out
 
 
 def test_settings_that_the_name_does_not_tell_are_columns(tmp_path, capsys):
