@@ -110,13 +110,13 @@ def _similarity_cell(key: str, value: float) -> str:
 def report_table(report: Mapping[str, Any], trainer: Trainer) -> Table:
     """The metrics of a report by split, in the trainer's columns."""
     table = Table(title=f"{report['env']}  {report['trainer']}  seed {report['seed']}", title_justify="left")
-    table.add_column("")
+    table.add_column("", no_wrap=True)  # rather the worst demonstrations, which are the widest cells of the others
     for header in trainer.columns:
         table.add_column(header, justify="right")
     for row in trainer.rows(dict(report)):
         table.add_row(*row)
     table.add_section()
-    seconds = ", ".join(f"{name} {value:.1f}" for name, value in report["wall_time_s"].items())
+    seconds = ", ".join(f"{name} {value:.0f}" for name, value in report["wall_time_s"].items())
     speed = f"{report['steps_per_second']:,.0f} /s" if report["steps_per_second"] else ""
     table.add_row(trainer.unit.replace("_", " "), f"{report[trainer.unit]:,}", speed)
     table.caption, table.caption_justify = f"seconds: {seconds}", "left"

@@ -2,12 +2,14 @@
 
 import io
 import re
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from rich.console import Console
 
 from mimic.trainers import progress
-from mimic.trainers.progress import TrainingProgress
+from mimic.trainers.progress import TrainingProgress, report_table
 
 STATUS = "distance 0.1139  gap 234.6%, held out 255.2%"
 
@@ -105,3 +107,16 @@ def test_without_a_terminal_there_is_line_for_each_evaluation(monkeypatch, clock
         f"step         500  {STATUS}  10 steps/s  elapsed 2:00  left 0:50",
         f"step       1,000  {STATUS}  10 steps/s  elapsed 3:00  left 0:00",
     ]
+
+
+def test_a_report_is_readable_in_80_columns():
+    """Rows of a policy that has hardly learned are the longest."""
+    rows = ["  kinematic bound (gap 0)", "0.1888", "0.1852"], ["worst", "53: 775%  36: 650%  30: 591%", "0: 1203%"]
+    trainer: Any = SimpleNamespace(columns=("training", "held out"), rows=lambda metrics: rows, unit="env_steps")
+    seconds = {"import": 2.3, "build": 11.6, "compile": 59.4, "train": 8.4, "evaluate": 7.4, "total": 93.7}
+    report = {"env": "planar4dof", "trainer": "ppo", "seed": 0, "env_steps": 40960, "steps_per_second": 4902.0}
+    console = Console(file=io.StringIO(), width=80)
+    console.print(report_table({**report, "wall_time_s": seconds}, trainer))
+    lines = written(console).splitlines()
+    assert any("  kinematic bound (gap 0) " in line for line in lines)
+    assert lines[-1].strip() == "seconds: import 2, build 12, compile 59, train 8, evaluate 7, total 94"
