@@ -16,7 +16,12 @@ def setting(key: str, value: Any) -> str:
 
 def shell_words(words: Sequence[str]) -> str:
     """Words of a command as one line for a shell."""
-    return " ".join(map(shlex.quote, words))
+    return " ".join(map(_shell_word, words))
+
+
+def _shell_word(word: str) -> str:
+    """A word in double quotes where this keeps Hydra's single ones readable, else as shlex quotes it."""
+    return f'"{word}"' if "'" in word and not set(word) & set('"$`\\!') else shlex.quote(word)
 
 
 def _text(value: Any) -> str:

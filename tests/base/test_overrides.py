@@ -10,8 +10,8 @@ from mimic.base.overrides import setting, shell_words
 
 VALUES = (
     None, True, -1, 2.5, 1e-9, "", "a", "a b", "it's", "x=1", "a,b", "null", "1e3", "3", "\\", "a\\'b", "a\\", "~/x",
-    "[a]", "{x}", "ünï", "a:b", "(x)", "#x", "/tmp/a=b", "-1", "a;b", 'a"b', ["*"], [1, "2", "a b"],
-    {"joint 1": 0.5, "j:2": [1]},
+    "[a]", "{x}", "ünï", "a:b", "(x)", "#x", "/tmp/a=b", "-1", "01.npz", "a $b `c`", "!a",
+    "a;b", 'a"b', ["*"], [1, "2", "a b"], {"joint 1": 0.5, "j:2": [1]},
 )  # fmt: skip
 
 
@@ -28,3 +28,7 @@ def test_settings_are_read_back(value):
     (word,) = shlex.split(shell_words([setting("env.key", value)]))
     parsed = OverridesParser.create().parse_override(word)
     assert parsed.key_or_group == "env.key" and read(parsed.value()) == value
+
+
+def test_quotes_of_a_shell_are_others_than_hydras():
+    assert shell_words([setting("out", "01.npz"), setting("arm", "left")]) == "\"out='01.npz'\" arm=left"
