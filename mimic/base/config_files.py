@@ -30,14 +30,16 @@ class _Loader(get_yaml_loader()):
         return super().compose_node(parent, index)
 
 
-def read_config(path: Path) -> DictConfig:
-    """Reads a YAML file that holds a mapping.
+def read_config(path: Path, *, may_be_empty: bool = False) -> DictConfig:
+    """Reads a YAML file that holds a mapping, or nothing if it may be empty.
 
     Raises:
       ValueError: see `read_text`; or it is not YAML or no mapping, or has an alias. The message does not name the file.
     """
     try:
         content = yaml.load(read_text(path, MAX_BYTES), _Loader)
+        if content is None and may_be_empty:
+            content = {}
         if not isinstance(content, dict):
             raise ValueError(f"expected keys and values, got {content!r:.80}")
         return OmegaConf.create(content)

@@ -43,6 +43,7 @@ from mimic.commands.key_help import key_lines
 from mimic.envs import registered_preset
 from mimic.envs.config import EnvConfig
 from mimic.runs.signals import STOPPED_BY_SIGNAL, ended_without_reader, watched_signals
+from mimic.runs.sweeps.hydra_plugins import bound_config_files
 from mimic.runs.sweeps.launchers import check_launcher, register_launchers
 from mimic.runs.sweeps.sweeper import FAILED, Outcome, register_sweeper
 from mimic.trainers.config import TRAINERS, TrainConfig
@@ -136,6 +137,7 @@ def register() -> None:
     _register_schemas()
     register_sweeper()
     register_launchers()
+    bound_config_files()
 
 
 def _single_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:

@@ -121,6 +121,13 @@ def test_bugs_in_the_work_keep_their_traceback(monkeypatch, tmp_path):
         cli.run(lambda config: work, "collect")
 
 
+def test_a_hostile_file_in_a_folder_of_configs(rejected, tmp_path):
+    (tmp_path / "configs" / "env").mkdir(parents=True)
+    aliases = "".join(f"{new}: &{new} [*{old},*{old},*{old}]\n" for old, new in zip("abcdef", "bcdefg", strict=True))
+    (tmp_path / "configs" / "env" / "mine.yaml").write_text("a: &a [1,1]\n" + aliases)
+    assert "expected no aliases, got *a" in rejected("train", f"--config-dir={tmp_path}/configs", "env=mine")
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
