@@ -63,11 +63,6 @@ class Background(Generic[T]):
             executor.shutdown(wait=False)
 
     @property
-    def is_started(self) -> bool:
-        """Whether the computation has started."""
-        return self._future is not None
-
-    @property
     def done(self) -> bool:
         """Whether the computation has ended, or failed."""
         return self._future is not None and self._future.done()

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -109,13 +110,15 @@ def _session(config: ViewConfig, env: EnvConfig) -> LiveSession:
 
 
 def _finish(config: ViewConfig, session: LiveSession) -> None:
-    """Ends a session, and writes what the hand drove."""
+    """Ends a session, and writes what the hand drove; further data sets have numbers."""
     session.finish()
-    if session.driven is not None and session.driven.episodes:
-        folder = Path(config.record).expanduser()
-        session.driven.write(folder)
-        print(f"view: {session.driven.episodes} episodes in {folder}", flush=True)
-    elif config.record:
+    first, number = Path(config.record).expanduser(), 0
+    for recorder in session.driven:
+        while os.path.lexists(folder := first.with_name(f"{first.name}-{number}") if number else first):
+            number += 1
+        recorder.write(folder)
+        print(f"view: {recorder.episodes} episodes in {folder}", flush=True)
+    if config.record and not session.driven:
         print("view: record: nothing was driven, as by hand=relative or the tab 'Hand'", flush=True)
 
 

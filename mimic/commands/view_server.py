@@ -1,6 +1,7 @@
 """The server of a live view: the page with its arms, and the rate of its frames, until a signal."""
 
 import contextlib
+import dataclasses
 import io
 import socket
 import sys
@@ -62,8 +63,8 @@ def serve(
     with noted_signals(signals, "view: ending; repeat to stop immediately"):
         server = make_server(config.host, config.port)
         try:
-            arms = (build_arm(arm, env.limits).embodiment for arm in (env.expert, env.learner))
-            match = env.metric.match_links(*arms)
+            free = build_arm(dataclasses.replace(env.learner, locked=()), env.limits)  # joints are locked in the view
+            match = env.metric.match_links(build_arm(env.expert, env.limits).embodiment, free.embodiment)
             expert = _name(env.expert, env), ArmShape(env.expert, env.limits, match.expert_colours)
             learner = _name(env.learner, env), ArmShape(env.learner, env.limits, match.learner_colours)
             is_flat = env.expert.model == env.learner.model == "planar"

@@ -1,10 +1,11 @@
-"""The controls of a live view: expert, metric and hand, each in a tab."""
+"""The controls of a live view: expert, metric, the learner's locks and its hand, each in a tab."""
 
 from typing import Protocol
 
 import viser
 
 from mimic.envs.config import EnvConfig
+from mimic.metric.config import CORRESPONDENCES
 from mimic.viewer.hand_controls import HandControls
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.manual_controls import by_user
@@ -40,20 +41,46 @@ class LiveControls:
             expert.add_widgets(server)
         with tabs.add_tab("Metric"):
             self._add_metric()
+        with tabs.add_tab("Learner"):
+            self._add_locks()
         with tabs.add_tab("Hand"):
             self._hand.add_widgets(server)
 
     def update(self) -> None:
         """Shows the settings of the session, after one that was not possible."""
+        self._show_locks()
         self._hand.update()
 
+    def _add_locks(self) -> None:
+        gui, session = self._server.gui, self._session
+        self._locks = {name: gui.add_checkbox(f"lock {name}", False) for name in session.joints}
+        for name, box in self._locks.items():
+            box.on_update(by_user(lambda value, name=name: self._lock(name, value)))
+        self._note = gui.add_markdown("")
+        self._show_locks()
+
+    def _lock(self, name: str, is_locked: bool) -> None:
+        self._session.lock(name, is_locked)
+        self._show_locks()
+
+    def _show_locks(self) -> None:
+        locked = self._session.settings.locked
+        for name, box in self._locks.items():
+            box.value = name in locked
+        angles = ", ".join(f"{name} at {locked[name]:z.2f} rad" for name in self._locks if name in locked)
+        self._note.content = f"Locked: {angles}." if angles else "A joint is locked at its angle in the start pose."
+
     def _add_metric(self) -> None:
-        gui, session, metric = self._server.gui, self._session, self._env.metric
+        gui, session, settings = self._server.gui, self._session, self._session.settings
+        choices = tuple(dict.fromkeys((*CORRESPONDENCES, settings.correspondence)))  # a run may have one of its own
+        correspondence = gui.add_dropdown("correspondence", choices, initial_value=settings.correspondence)
+        correspondence.on_update(by_user(lambda value: session.change(correspondence=value)))
         for term in ("rotation", "translation"):
-            initial = getattr(metric, term)
-            is_left_out = term == "translation" and initial == 0  # the compiled functions lack the term
+            initial = getattr(settings, term)
             weight = gui.add_slider(
                 term, 0.0, max(_MAX_WEIGHT, initial), _WEIGHT_STEP, initial,
-                disabled=metric.adaptive or is_left_out, hint="weight of this term of the distance",
+                disabled=self._env.metric.adaptive,
+                hint="weight of this term of the distance",
             )  # fmt: skip
-            weight.on_update(by_user(lambda value, term=term: session.weigh(**{term: float(value)})))
+            weight.on_update(by_user(lambda value, term=term: session.change(**{term: float(value)})))
+        gui.add_markdown("A new correspondence, and a first weight on translation, take some seconds to compile.")

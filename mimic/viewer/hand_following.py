@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -84,18 +85,18 @@ class HandFollower:
       is_recorded: whether what is driven is kept.
 
     Attributes:
-      recorder: of what was driven; None before, and where it is not kept.
+      recorders: of what was driven, one each time that other joints of the learner are locked.
     """
 
     def __init__(self, expert: Embodiment, env: EnvConfig, is_recorded: bool = False):
         self._expert, self._env, self._is_recorded = expert, env, is_recorded
-        self._locked = dict(env.build_arm("learner").locked)  # at the angles of the view
-        self.recorder: TeleoperationRecorder | None = None
+        self.recorders: list[TeleoperationRecorder] = []
         self._teleoperator: Teleoperator | None = None
         self._made_of: Any = None  # what the teleoperator is made of
         self._is_engaged, self._left = False, 0.0
         self._continuous = continuous_joints(expert)
         self._expert_qpos: np.ndarray | None = None  # of the last frame [rad]
+        self._recorded: Mapping[str, float] | None = None  # locked joints of the last recorder
 
     def stop(self) -> None:
         """Forgets the motion; the next step begins where the learner is then."""
@@ -104,6 +105,7 @@ class HandFollower:
     def step(
         self,
         settings: HandSettings,
+        locked: Mapping[str, float],
         qpos: Float[np.ndarray, " learner_joints"],
         expert_qpos: Float[np.ndarray, " joints"],
         dt: float,
@@ -113,6 +115,7 @@ class HandFollower:
 
         Args:
           settings: of the teleoperator; others begin anew from `qpos`.
+          locked: joints of the learner [rad].
           qpos: the learner's pose [rad].
           expert_qpos: the expert's pose [rad].
           dt: the time [s].
@@ -121,9 +124,9 @@ class HandFollower:
         Raises:
           ValueError: see `Teleoperator`.
         """
-        made_of = dataclasses.replace(settings, is_engaged=True)
+        made_of = dataclasses.replace(settings, is_engaged=True), tuple(locked.items())
         if self._teleoperator is None or self._made_of != made_of:
-            self._teleoperator, self._made_of = self._make(settings, qpos), made_of
+            self._teleoperator, self._made_of = self._make(settings, locked, qpos), made_of
             self._is_engaged, self._left, self._expert_qpos = False, 0.0, None
         operator = self._teleoperator
         if settings.is_engaged != self._is_engaged:
@@ -131,7 +134,7 @@ class HandFollower:
             self._is_engaged = settings.is_engaged
         ticks = max(int(self._left + dt * _RATE), 1)
         self._left = max(self._left + dt * _RATE - ticks, 0.0)
-        drive = (self.recorder or operator).step
+        drive = self.recorders[-1].step if self._is_recorded else operator.step
         last, self._expert_qpos = self._expert_qpos, np.array(expert_qpos, float)
         moved = wrap_angles(self._expert_qpos - (self._expert_qpos if last is None else last), self._continuous)
         for rest in np.arange(ticks)[::-1] / ticks:
@@ -139,8 +142,8 @@ class HandFollower:
         goal = operator.goal or (np.zeros((0, 3)), np.zeros((0, 3, 3)))
         return command.qpos, HandFrame(*goal, command.status, command.gripper)
 
-    def _make(self, settings: HandSettings, qpos: np.ndarray) -> Teleoperator:
-        config = dataclasses.replace(self._env.learner, home=None, locked=self._locked)
+    def _make(self, settings: HandSettings, locked: Mapping[str, float], qpos: np.ndarray) -> Teleoperator:
+        config = dataclasses.replace(self._env.learner, home=None, locked=dict(locked))
         arm = build_arm(config, "hardware", self._env.metric.links).embodiment
         hand: Any = settings.hand
         operator = Teleoperator(
@@ -148,10 +151,11 @@ class HandFollower:
             rate=_RATE, velocity=finite_velocity_limit(arm), metric=self._env.metric,
         )  # fmt: skip
         operator.reset(np.clip(qpos, *operator.limits.position.T))
-        if self.recorder is not None:
-            self.recorder.operator = operator
+        if self._is_recorded and self._recorded == locked:
+            self.recorders[-1].operator = operator
         elif self._is_recorded:
-            self.recorder = TeleoperationRecorder(operator)
+            self.recorders.append(TeleoperationRecorder(operator))
+            self._recorded = dict(locked)
         return operator
 
 

@@ -1,7 +1,6 @@
 """State of a live view: motion of the expert, motion of the learner, and the frames to show. Needs no browser."""
 
 import dataclasses
-import functools
 import math
 import threading
 from collections.abc import Mapping
@@ -12,11 +11,19 @@ from jaxtyping import Float
 
 from mimic.arms.arm import finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
-from mimic.base.compilation import Background
 from mimic.envs.config import EnvConfig
 from mimic.retargeting.teleoperation_recording import TeleoperationRecorder
 from mimic.viewer.hand_following import FREE, HandDrag, HandFollower, HandFrame, HandSettings
-from mimic.viewer.tracking import CompiledFunctions, PoseComparison, Weights, compile_functions, step_towards
+from mimic.viewer.tracking import (
+    CompiledFunctions,
+    FunctionCache,
+    PoseComparison,
+    Settings,
+    home_angles,
+    initial_settings,
+    lock_angles,
+    step_towards,
+)
 
 _GLIDE = 1.0  # s, duration of the expert's motion to the pose of a button
 _REST_TIME = 0.25  # s that the expert rests before the learner may leave a local minimum
@@ -31,6 +38,7 @@ class Frame:
 
     Attributes:
       expert, learner: angle of every joint by name, including locked joints [rad].
+      locked: locked joints of the learner.
       expert_links, learner_links: names of the links, base to tip.
       distance: embodiment distance.
       bound: kinematic bound of the distance; NaN while it is unknown.
@@ -42,6 +50,7 @@ class Frame:
 
     expert: Mapping[str, float]
     learner: Mapping[str, float]
+    locked: tuple[str, ...]
     expert_links: tuple[str, ...]
     learner_links: tuple[str, ...]
     distance: float
@@ -62,7 +71,7 @@ class LiveSession:
 
     Attributes:
       expert: embodiment of the expert.
-      weights: of the metric.
+      settings: requested settings; they take effect as soon as their functions are compiled.
       hand: how the learner's hand follows.
 
     Raises:
@@ -72,11 +81,11 @@ class LiveSession:
     def __init__(self, env: EnvConfig, hand: HandSettings | None = None, is_recorded: bool = False):
         self.hand: HandSettings = hand or HandSettings()
         self.expert: Embodiment = env.build_arm("expert").embodiment
-        self.weights = Weights(env.metric.translation, env.metric.rotation)
-        self._learner = env.build_arm("learner")
-        self._functions = Background(functools.partial(compile_functions, env))
+        self.settings: Settings = initial_settings(env)
+        self._functions = FunctionCache(env)
+        self._lock_angles = lock_angles(env)
         self._lock = threading.RLock()
-        self._qpos = np.array(self._learner.embodiment.home, np.float32)  # pose of the learner
+        self._angles = {**home_angles(env), **self.settings.locked}  # of all joints of the learner [rad]
         self._pose = np.array(self.expert.home, np.float32)
         self._motion: tuple[np.ndarray, np.ndarray] | None = None  # times [s] and poses [rad] of the expert
         self._time = 0.0  # s, since the start of the motion
@@ -86,7 +95,13 @@ class LiveSession:
         self._solved: tuple[Any, np.ndarray, float] | None = None  # request, best pose and bound
         self._drag, self._follower = HandDrag(self.expert), HandFollower(self.expert, env, is_recorded)
         self._gripper: float | None = None  # opening of the expert's
+        self._active = self.settings  # the last settings with compiled functions
         self._rest_key: Any = None  # request for which the learner is at rest
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the learner's joints, base to tip, including those that are locked."""
+        return tuple(self._lock_angles)
 
     @property
     def pose(self) -> Float[np.ndarray, " joints"]:
@@ -160,29 +175,39 @@ class LiveSession:
             self.hand = dataclasses.replace(self.hand, **settings)
             self._goal = self._rest_key = None
 
-    def weigh(self, **weights: float) -> None:
-        """Changes some of the `Weights`.
+    def change(self, **settings: Any) -> None:
+        """Changes some of the `Settings`.
 
         Raises:
           ValueError: a value is invalid.
         """
         with self._lock:
-            self.weights, self._goal = dataclasses.replace(self.weights, **weights), None
+            self.settings = dataclasses.replace(self.settings, **settings)
+            self._goal = None
+
+    def lock(self, joint: str, is_locked: bool) -> None:
+        """Locks a joint of the learner, or frees it."""
+        with self._lock:
+            others = {name: at for name, at in self.settings.locked.items() if name != joint}
+            self.change(locked={**others, joint: self._lock_angles[joint]} if is_locked else others)
 
     @property
     def is_compiling(self) -> bool:
-        """Whether functions are still being compiled, including the kinematic bound."""
-        return not (self._functions.done and self._functions().best.done)
+        """Whether the functions of the requested settings are still being compiled, including the kinematic bound."""
+        return not self._functions.is_complete(self.settings)
+
+    def compile(self) -> CompiledFunctions:
+        """Waits for the compiled functions of the requested settings and returns them."""
+        return self._functions.wait(self.settings)
 
     def finish(self) -> None:
-        """Waits for a running compilation: a process must not end during it."""
-        if self._functions.is_started:
-            self._functions().best()
+        """Waits for a running compilation."""
+        self._functions.finish()
 
     @property
-    def driven(self) -> TeleoperationRecorder | None:
-        """What the hand drove; None where nothing is recorded."""
-        return self._follower.recorder
+    def driven(self) -> list[TeleoperationRecorder]:
+        """What the hand drove, a recorder for each of the settings."""
+        return [recorder for recorder in self._follower.recorders if recorder.episodes]
 
     def advance(self, dt: float) -> Frame | None:
         """Advances the view by a time step [s].
@@ -191,56 +216,73 @@ class LiveSession:
           The frame to show; None if nothing has changed, or before the first functions are compiled.
 
         Raises:
-          ValueError: the settings of the hand are not possible; the hand is left to the metric.
+          ValueError: the requested settings are invalid; the previous settings are restored.
         """
         with self._lock:
-            self._functions.start()
-            if not self._functions.done:
+            functions = self._activate_functions()
+            if functions is None:
                 return None
-            functions = self._functions()
+            settings = self._active
             self._advance_expert(dt)
-            expert, current = self._pose, self._qpos
-            request = expert.tobytes(), self.weights
-            if self._rest_key == (request, functions.best.done):
+            arm, expert = functions.learner.embodiment, self._pose
+            current = np.array([self._angles[name] for name in arm.joint_names], np.float32)
+            request = expert.tobytes(), settings
+            if self._rest_key == (request, functions.best is None):
                 return None
             best, bound = self._best(functions, request)
             hand = None
             if self.hand.hand == FREE:
                 self._follower.stop()
-                pose = self._step(functions, current, best, bound, dt)
+                pose = self._step(functions, current, best, bound, settings.weights, dt)
             else:
-                pose, hand = self._follow_hand(current, dt)
-            comparison, self._qpos = functions.compare(expert, pose, self.weights.array), pose
+                pose, hand = self._follow_hand(arm, current, dt)
+            comparison = functions.compare(expert, pose, settings.weights)
+            self._angles |= dict(zip(arm.joint_names, map(float, pose), strict=True))
+            self._angles |= functions.learner.locked
             is_at_rest = (
                 self._goal is None
                 and self._rest_time > (2 * _REST_TIME if hand is None else _SETTLED)
                 and bool(np.all(np.abs(pose - current) < _REST_ANGLE))
             )
-            self._rest_key = (request, functions.best.done) if is_at_rest else None
-            return self._frame(comparison, bound, hand)
+            self._rest_key = (request, functions.best is None) if is_at_rest else None
+            return self._frame(functions, comparison, bound, hand)
 
-    def _follow_hand(self, current: np.ndarray, dt: float) -> tuple[np.ndarray, HandFrame]:
+    def _activate_functions(self) -> CompiledFunctions | None:
+        """The functions of the requested settings, or until these are compiled, of the previous settings."""
+        try:
+            functions = self._functions.get(self.settings)
+        except ValueError:
+            self.settings = self._active
+            raise
+        if functions is None:
+            return self._functions.get(self._active)
+        self._active = self.settings
+        return functions
+
+    def _follow_hand(self, arm: Embodiment, current: np.ndarray, dt: float) -> tuple[np.ndarray, HandFrame]:
         """The learner's next pose with a hand that follows; it starts where the learner is.
 
         Raises:
           ValueError: the settings are not possible; the hand is left to the metric.
         """
         try:
-            qpos, hand = self._follower.step(self.hand, current, self._pose, dt, self._gripper)
+            qpos, hand = self._follower.step(self.hand, self._active.locked, current, self._pose, dt, self._gripper)
         except ValueError:
             self.hand = dataclasses.replace(self.hand, hand=FREE)
             raise
-        arm = self._learner.embodiment
         jump = finite_velocity_limit(arm) * dt
         return np.asarray(step_towards(arm, current, qpos, jump)[0], np.float32), hand
 
-    def _frame(self, comparison: PoseComparison, bound: float, hand: HandFrame | None) -> Frame:
-        distance, arm = float(comparison.distance), self._learner.embodiment
+    def _frame(
+        self, functions: CompiledFunctions, comparison: PoseComparison, bound: float, hand: HandFrame | None
+    ) -> Frame:
+        distance = float(comparison.distance)
         return Frame(
             expert=dict(zip(self.expert.joint_names, map(float, self._pose), strict=True)),
-            learner=dict(zip(arm.joint_names, map(float, self._qpos), strict=True)) | dict(self._learner.locked),
+            learner=dict(self._angles),
+            locked=tuple(self._active.locked),
             expert_links=self.expert.link_names,
-            learner_links=arm.link_names,
+            learner_links=functions.learner.embodiment.link_names,
             distance=distance,
             bound=min(bound, distance),  # many initial guesses may miss a minimum that the path has reached
             matrix=np.asarray(comparison.matrix),
@@ -264,10 +306,10 @@ class LiveSession:
 
     def _best(self, functions: CompiledFunctions, request: Any) -> tuple[np.ndarray, float]:
         """The best pose and its distance, computed once for each pose of the expert."""
-        if not functions.best.done:
+        if functions.best is None:
             return self._pose, math.nan
         if self._solved is None or self._solved[0] != request:
-            qpos, distance = functions.best()(self._pose, self.weights.array)
+            qpos, distance = functions.best(self._pose, request[1].weights)
             self._solved = request, np.asarray(qpos), float(distance)
         return self._solved[1:]
 
@@ -277,12 +319,13 @@ class LiveSession:
         current: np.ndarray,
         best: np.ndarray,
         bound: float,
+        weights: np.ndarray,
         dt: float,
     ) -> np.ndarray:
         """The learner's next pose; no joint exceeds its velocity limit."""
-        arm, weights = self._learner.embodiment, self.weights.array
+        arm = functions.learner.embodiment
         jump = finite_velocity_limit(arm).astype(np.float32) * dt
-        if self._seeks and functions.best.done:
+        if self._seeks and functions.best is not None:
             self._goal = best
         goal = self._goal
         if goal is None or goal.shape != current.shape:

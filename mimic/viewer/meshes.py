@@ -31,24 +31,28 @@ class Part:
       vertices: vertex positions [m].
       faces: vertex indices of the triangles.
       rgba: colour and opacity, from 0 to 1.
+      locked_joint: joint that the mesh marks as locked; the mesh is hidden while the joint is free.
     """
 
     body: int
     vertices: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "faces 3"]
     rgba: tuple[float, ...]
+    locked_joint: str | None = None
 
 
 class ArmShape:
     """Meshes of an arm and their forward kinematics.
 
     Args:
-      config: config of the arm; discs mark its locked joints.
+      config: config of the arm; locked joints can be moved too.
       limits: see `EnvConfig`.
       colours: colours of links by name, see `LinkMatch`. Default None: those of the model.
 
     Attributes:
+      joint_names: joints of the chain, base to tip.
       parts: meshes of the arm.
+      num_bodies: number of bodies in the model, including the world.
       reach: length of the chain [m].
 
     Raises:
@@ -56,13 +60,15 @@ class ArmShape:
     """
 
     def __init__(self, config: ArmConfig, limits: str = "none", colours: Mapping[str, Colour] | None = None):
-        arm = build_arm(config, limits)
+        free = build_arm(dataclasses.replace(config, locked=()), limits).embodiment
         self._model = visual_spec(config, limits, colours)[0].compile()
         self._data = mujoco.MjData(self._model)
         mujoco.mj_kinematics(self._model, self._data)
         self._base = find_chain(self._model, config.base, config.tip).base
-        self.reach = float(arm.embodiment.chain_length)
-        marks = [_mark(self._model, name, self.reach) for name in arm.locked]
+        self.joint_names = free.joint_names
+        self.num_bodies = int(self._model.nbody)
+        self.reach = float(free.chain_length)
+        marks = [_mark(self._model, name, self.reach) for name in free.joint_names]
         self.parts: list[Part] = [*_visible_parts(self._model), *marks]
 
     def base_pose(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "4"]]:
@@ -127,9 +133,9 @@ def along_z(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
     return quaternion
 
 
-def _part(body: int, mesh: Any, rgba: tuple[float, ...]) -> Part:
+def _part(body: int, mesh: Any, rgba: tuple[float, ...], locked_joint: str | None = None) -> Part:
     vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
-    return Part(body, vertices, faces, rgba)
+    return Part(body, vertices, faces, rgba, locked_joint)
 
 
 def _triangles(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
@@ -162,7 +168,7 @@ def _mark(model: mujoco.MjModel, joint_name: str, reach: float) -> Part:
     quaternion = np.zeros(4)
     mujoco.mju_quatZ2Vec(quaternion, joint.axis)
     disc.apply_transform(_transform(joint.pos, quaternion))
-    return _part(int(joint.bodyid[0]), disc, LOCKED)
+    return _part(int(joint.bodyid[0]), disc, LOCKED, joint_name)
 
 
 def _transform(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:

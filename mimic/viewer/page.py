@@ -1,6 +1,6 @@
 """The page of every view in viser: two arms in 3-D, numbers, heat maps and a chart."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -80,8 +80,8 @@ class Page:
             self._chart.content = chart
 
     def _move(self, frame: Frame) -> None:
-        self._expert.move_to(frame.expert)
-        self._learner.move_to(frame.learner)
+        self._expert.move_to(frame.expert, ())
+        self._learner.move_to(frame.learner, frame.locked)
         self._ghost.show(frame)
         self._goals.show(frame.hand)
 
@@ -105,17 +105,26 @@ class _DrawnArm:
             )
             for body in bodies
         }
+        self._marks: dict[str, Any] = {}
         for index, part in enumerate(shape.parts):
-            _add_mesh(scene, f"{path}/body{part.body}/part{index}", part)
+            mesh = _mesh(scene, f"{path}/body{part.body}/part{index}", part)
+            if part.locked_joint is not None:
+                self._marks[part.locked_joint] = mesh
 
-    def move_to(self, angles: Mapping[str, float]) -> None:
+    def move_to(self, angles: Mapping[str, float], locked: Sequence[str]) -> None:
         positions, quaternions = self._shape.bodies(angles)
         for body, frame in self._frames.items():
             frame.position, frame.wxyz = positions[body], quaternions[body]
+        for name, mark in self._marks.items():
+            if mark.visible != (name in locked):
+                mark.visible = name in locked
 
 
 class _Ghost:
-    """The expert, translucent and scaled, at the learner, with lines between corresponding links."""
+    """The expert, translucent and scaled, at the learner, with lines between corresponding links.
+
+    The learner's links keep their number while its joints are locked, so that the lines stay where they are.
+    """
 
     def __init__(self, server: viser.ViserServer, shape: ArmShape, match: LinkMatch):
         self._match = match
@@ -180,14 +189,15 @@ def _add_base(server: viser.ViserServer, path: str, shape: ArmShape) -> Any:
     return server.scene.add_frame(path, show_axes=False, position=position, wxyz=wxyz)
 
 
-def _add_mesh(scene: viser.SceneApi, path: str, part: Part) -> None:
+def _mesh(scene: viser.SceneApi, path: str, part: Part) -> Any:
     red, green, blue, alpha = part.rgba
-    scene.add_mesh_simple(
+    return scene.add_mesh_simple(
         path,
         part.vertices,
         part.faces,
         color=(red, green, blue),
         opacity=alpha if alpha < 1 else None,
+        visible=part.locked_joint is None,
         side="double",
     )
 

@@ -2,6 +2,7 @@
 
 import importlib.util
 
+import numpy as np
 import pytest
 
 if importlib.util.find_spec("viser") is None:
@@ -11,7 +12,7 @@ from mimic.commands import view_server
 from mimic.commands.config import ViewConfig
 from mimic.envs import env_config
 from mimic.viewer.controls import LiveControls
-from mimic.viewer.live_session import LiveSession
+from mimic.viewer.live_session import Frame, LiveSession
 from mimic.viewer.manual_controls import ManualControls
 from tests.helpers.commands import free_port
 
@@ -31,13 +32,18 @@ def serve():
     return serve_once
 
 
-def test_the_weights_of_the_metric_have_sliders(serve):
+def test_locked_joints_are_checked_named_and_marked(serve):
     def show(page, config):
         session = LiveSession(config.env)
         controls = LiveControls(page.server, session, config.env, ManualControls(session, config.env))
-        controls.update()
-        sliders = {handle.label: handle for handle in page.server.gui._gui_input_handle_from_uuid.values()}
-        assert not sliders["rotation"].disabled and not sliders["translation"].disabled
-        assert sliders["rotation"].value == config.env.metric.rotation
+        checked = [name for name, box in controls._locks.items() if box.value]
+        assert len(controls._locks) == 7 and checked == ["joint3", "joint6", "joint7"]
+        controls._lock("joint3", False)
+        assert not controls._locks["joint3"].value
+        assert controls._note.content == "Locked: joint6 at 0.00 rad, joint7 at 0.00 rad."
+        angles = dict.fromkeys(session.joints, 0.1)
+        for locked in ((), ("joint4",)):
+            page.move(Frame(angles, angles, locked, (), (), 0.1, 0.1, np.eye(1), np.eye(1), {}))
+            assert {name for name, mark in page._learner._marks.items() if mark.visible} == set(locked)
 
     serve(show)

@@ -5,7 +5,6 @@ import numpy as np
 
 import mimic
 from mimic.arms.arm import ArmConfig
-from mimic.arms.rendering import LOCKED
 from mimic.envs import env_config
 from mimic.viewer import html
 from mimic.viewer.meshes import ArmShape, places
@@ -13,7 +12,7 @@ from mimic.viewer.meshes import ArmShape, places
 
 def test_meshes_are_placed_as_in_mujoco():
     shape = ArmShape(env_config("panda4dof").learner)
-    angles = dict.fromkeys(mimic.panda().joint_names, 0.0) | {"joint2": 0.7, "joint4": -1.2}
+    angles = dict.fromkeys(shape.joint_names, 0.0) | {"joint2": 0.7, "joint4": -1.2}
     model = mujoco.MjModel.from_xml_path(str(mimic.arms.embodiment.panda_path()))
     data = mujoco.MjData(model)
     for name, angle in angles.items():
@@ -22,7 +21,8 @@ def test_meshes_are_placed_as_in_mujoco():
     positions, quaternions = shape.bodies(angles)
     np.testing.assert_allclose(positions, data.xpos)
     np.testing.assert_allclose(quaternions, data.xquat)
-    assert [part.rgba for part in shape.parts].count(LOCKED) == 3  # discs
+    marked = [part.locked_joint for part in shape.parts if part.locked_joint]
+    assert marked == list(shape.joint_names)
     left, right = places([shape, shape])
     assert left[1] < 0 < right[1]
 
@@ -78,7 +78,7 @@ def test_the_chart_is_flat_while_the_arms_rest(monkeypatch):
     monkeypatch.setattr(html, "chart", lambda time, curves: drawn.update(time=time, distance=curves[0][1]) or "")
     history = History()
     for distance in (0.0, 0.0, 0.4, 0.2):
-        history.add(Frame({}, {}, (), (), distance, 0.0, np.eye(1), np.eye(1), {}))
+        history.add(Frame({}, {}, (), (), (), distance, 0.0, np.eye(1), np.eye(1), {}))
     history.chart()
     assert np.interp(8.9, drawn["time"], drawn["distance"]) == 0  # at rest until 9 s, no ramp from 1 s on
     assert list(drawn["distance"]) == [0.0, 0.0, 0.0, 0.4, 0.2]

@@ -40,7 +40,7 @@ def env(tmp_path_factory):
 def run(follower, settings, learner, expert_qpos, seconds):
     """The learner's pose and the frame after a time."""
     for _ in range(round(seconds / TICK)):
-        learner, frame = follower.step(settings, learner, expert_qpos, TICK)
+        learner, frame = follower.step(settings, {}, learner, expert_qpos, TICK)
     return learner, frame
 
 
@@ -75,18 +75,18 @@ def test_a_clutch_takes_up_the_motion_where_it_is(panda, env):
 
 
 def test_what_is_driven_is_a_data_set(panda, env, tmp_path, capsys):
-    """Each closing of the clutch and other place of the base begin an episode."""
+    """Each closing of the clutch and other place of the base begin an episode; other locks, another data set."""
     pytest.importorskip("pyarrow", reason="needs pyarrow")
     session = LiveSession(env, hand=HandSettings("relative"), is_recorded=True)
     follower, learner = session._follower, np.array([0.3, -1.2, 1.4, -1.0, -1.2, 0.2])
     for settings in ({"is_engaged": True}, {"is_engaged": False}, {"is_engaged": True}, {"base": (0.1, 0, 0, 0)}):
         learner, _ = run(follower, HandSettings("relative", **settings), learner, HOME, 0.2)
     names = build_arm(env.learner).embodiment.joint_names
-    learner, frame = follower.step(HandSettings("relative"), learner, HOME, TICK, 0.25)
+    _, frame = follower.step(HandSettings("relative"), {names[2]: 1.4}, np.delete(learner, 2), HOME, TICK, 0.25)
     assert frame.gripper == 0.25 and "gripper at 0.25" in frame.note
     config = ViewConfig(env=env, record=str(tmp_path / "driven") + "/")
     view._finish(config, session)
-    assert f"4 episodes in {tmp_path}/driven\n" in capsys.readouterr().out
+    assert f"3 episodes in {tmp_path}/driven\nview: 1 episodes in {tmp_path}/driven-1\n" in capsys.readouterr().out
     motions = read_lerobot(tmp_path / "driven", names, "action").motions
     np.testing.assert_allclose(list(motions.values())[-1].qpos[-1], learner, atol=1e-6)
     view._finish(config, LiveSession(env, is_recorded=True))
@@ -101,8 +101,8 @@ def test_the_expert_moves_steadily_within_a_frame(panda, env):
     for frame in range(30):
         qpos = HOME + np.eye(7)[0] * TICK * frame
         qpos[6] = (2.9 + TICK * frame + np.pi) % (2 * np.pi) - np.pi
-        learner, _ = follower.step(HandSettings("relative"), learner, qpos, TICK)
-    led = np.array([tick.leader for tick in session.driven._episodes[0]])
+        learner, _ = follower.step(HandSettings("relative"), {}, learner, qpos, TICK)
+    led = np.array([tick.leader for tick in session.driven[0]._episodes[0]])
     moved = np.diff(led[3:], axis=0)
     moved[:, 6] = (moved[:, 6] + np.pi) % (2 * np.pi) - np.pi
     assert np.all(moved[:, [0, 6]] > 0.008) and np.all(moved[:, [0, 6]] < 0.0115)
@@ -168,7 +168,7 @@ def test_the_page_has_a_handle_a_tab_and_goals(env):
             count = int(is_shown)
             status = TeleoperationStatus(state, "", 0.0, 0.0)
             hand = HandFrame(np.full((count, 3), 0.2), np.tile(np.eye(3), (count, 1, 1)), status)
-            frame = Frame(angles[0], angles[1], (), (), 0.1, 0.1, np.eye(1), np.eye(1), {}, hand=hand)
+            frame = Frame(angles[0], angles[1], (), (), (), 0.1, 0.1, np.eye(1), np.eye(1), {}, hand=hand)
             page.move(frame)
             goals = page._goals
             assert goals._axes[0].visible == is_shown and not page._ghost._root.visible

@@ -1,15 +1,16 @@
-"""The session of the live view, without a browser: motion, values, and weights."""
+"""The session of the live view, without a browser: motion, values, and settings."""
+
+import dataclasses
 
 import numpy as np
 import pytest
 
 import mimic
-from mimic.arms.arm import build_arm, finite_velocity_limit
+from mimic.arms.arm import ArmConfig, build_arm, finite_velocity_limit
 from mimic.arms.link_match import hand_poses
-from mimic.base.compilation import in_background
 from mimic.envs import env_config
 from mimic.viewer.live_session import LiveSession
-from mimic.viewer.tracking import compile_functions, step_towards
+from mimic.viewer.tracking import Settings, initial_settings, learner_arm, step_towards
 
 TICK = 1 / 30
 
@@ -29,9 +30,9 @@ def live(env, compiled):
 
 @pytest.fixture(scope="module")
 def compiled(env):
-    functions = in_background(lambda: compile_functions(env))
-    functions().best()
-    return functions
+    session = LiveSession(env)
+    session.compile()
+    return session._functions
 
 
 def settle(session, seconds=6.0):
@@ -53,7 +54,7 @@ def test_what_is_no_number_changes_nothing(live):
         assert np.array_equal(live.pose, before)
     for weight in (float("nan"), float("inf"), -0.1):
         with pytest.raises(ValueError, match="rotation: expected a finite weight of at least 0"):
-            live.weigh(rotation=weight)
+            live.change(rotation=weight)
 
 
 def test_the_learner_tracks_and_rests_at_the_bound(live):
@@ -107,7 +108,7 @@ def test_what_is_shown_is_the_metric(live, env):
 
 
 def test_no_joint_of_the_learner_jumps(live, env):
-    arm = env.build_arm("learner").embodiment
+    arm = learner_arm(env, live.settings.locked).embodiment
     frame = settle(live)
     rng = np.random.default_rng(1)
     for step in range(90):
@@ -138,7 +139,7 @@ def test_weights_change_without_compiling_and_the_distance_scales(live):
     live.move(2, 1.0)  # a joint that the learner has not; in the zero pose, joint 0 has the same axis
     before = settle(live).distance
     assert before > 1e-2
-    live.weigh(translation=2.0, rotation=2.0)
+    live.change(translation=2.0, rotation=2.0)
     frame = live.advance(TICK)
     assert frame is not None and frame.distance == pytest.approx(2 * before, rel=1e-3)  # the minimum stays in its place
 
@@ -165,14 +166,55 @@ def test_a_hand_that_follows_is_where_the_dragged_one_of_the_expert_is(live, env
 
 
 @pytest.mark.slow
-def test_the_learner_tracks_while_its_bound_is_compiled():
+def test_the_view_goes_on_while_another_correspondence_is_compiled():
     session = LiveSession(env_config("planar4dof"))
-    assert session.advance(TICK) is None and session.is_compiling
-    functions = session._functions()
-    frame = session.advance(TICK)
-    assert frame is not None and (functions.best.done or np.isnan(frame.bound))
-    session.finish()
-    assert not session.is_compiling and settle(session).bound > 0
+    session.compile()
+    first = settle(session)
+    session.change(correspondence="hard")
+    session.move(0, 0.5)
+    during = session.advance(TICK)
+    assert during is not None and session.is_compiling
+    np.testing.assert_array_equal(during.matrix, first.matrix)
+    session.compile()
+    after = session.advance(TICK)
+    assert after is not None and set(np.unique(after.matrix)) <= {0, 1, 2} and np.any(after.matrix != first.matrix)
+
+
+def test_locked_joints_switch_the_learner(env):
+    session = LiveSession(dataclasses.replace(env, learner=ArmConfig(locked={"joint3": 0.4})))
+    session.lock("joint6", True)
+    assert session.settings.locked == {"joint3": 0.4, "joint6": 0.0}
+    session.lock("joint3", False)
+    fewer = learner_arm(env, session.settings.locked)
+    assert fewer.embodiment.num_joints == 6 and fewer.locked == {"joint6": 0.0}
+    session.lock("joint3", True)  # at the angle of the config again
+    assert session.settings.locked == {"joint6": 0.0, "joint3": 0.4}
+    with pytest.raises(ValueError, match="joint9"):
+        learner_arm(env, {"joint9": 0.0})
+
+
+def test_locking_the_last_joint_is_rejected_and_undone():
+    session = LiveSession(env_config("planar4dof"))
+    before = session.settings
+    for joint in ("joint1", "joint2", "joint3", "joint4"):
+        session.lock(joint, True)
+    with pytest.raises(ValueError, match="all 4 joints are locked"):
+        session.advance(TICK)
+        session.finish()
+        session.advance(TICK)
+    assert session.settings == before
+
+
+def test_settings_that_differ_only_in_weights_share_functions(env):
+    settings = initial_settings(env)
+    assert (
+        settings.locked == dict.fromkeys(("joint3", "joint6", "joint7"), 0.0)
+        and settings.correspondence == "arc_length"
+    )
+    assert dataclasses.replace(settings, rotation=0.3).compilation_key == settings.compilation_key
+    assert dataclasses.replace(settings, correspondence="hard").compilation_key != settings.compilation_key
+    with pytest.raises(ValueError, match="expected one of arc_length, overlap, hard, soft"):
+        Settings({}, "none", 0.0, 1.0)
 
 
 def test_a_joint_takes_the_shorter_way_around():
