@@ -1,4 +1,4 @@
-"""Plots of a run: its training, and the learner's distance to the expert."""
+"""Plots of a run: its training, and the learner's distance and similarity to the expert."""
 
 import csv
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ import matplotlib.ticker  # noqa: E402
 import numpy as np  # noqa: E402
 
 from mimic.base.files import read_text  # noqa: E402
-from mimic.evaluation.labels import SPLIT_NAMES  # noqa: E402
+from mimic.evaluation.labels import SIMILARITY_HEADERS, SIMILARITY_NAMES, SPLIT_NAMES  # noqa: E402
 from mimic.evaluation.rollout_metrics import WORST  # noqa: E402
 from mimic.runs.files import METRICS  # noqa: E402
 
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 _COLOURS = {"train": "tab:blue", "held_out": "tab:orange"}
 _LABELS = {split: name.replace(" ", "-") for split, name in SPLIT_NAMES.items()}  # adjectives: held-out demonstrations
+_MARKERS = ("o", "tab:blue"), ("^", "tab:orange")  # of an arm's metrics
+_ARM_WIDTH, _MIN_WIDTH = 0.17, 3.0  # inches, of an arm's column and of a panel
+_LINEAR = 0.1  # %: values below it are on a linear axis, as a result at the optimum has the value 0
 
 
 def plot_training(folder: Path, metric: str, label: str, *, labels: Mapping[str, str], title: str) -> None:
@@ -100,6 +103,68 @@ def plot_demonstrations(
     rows[0, 0].set(ylabel="optimality gap [%]", ylim=(min(0, 100 * np.nanmin([0.0, *table["optimality_gap"]])), None))
     rows[1, 0].set(ylabel="mean embodiment distance", ylim=(0, None))
     _finish(figure, rows[1, 0], f"{title}: {controller}, each demonstration; the worst by their numbers", out)
+
+
+def plot_similarity(similarity: Mapping[str, Mapping[str, Mapping[str, float]]], out: Path, *, title: str) -> None:
+    """Plots bars of each measure of similarity, for the controller and each baseline, by split."""
+    names = list(similarity)
+    figure, all_axes = plt.subplots(
+        1, len(SIMILARITY_HEADERS), figsize=(12, 0.42 * len(names) + 1.6), sharey=True, layout="constrained"
+    )
+    place = np.arange(len(names))
+    for axes, (key, header) in zip(all_axes, SIMILARITY_HEADERS.items(), strict=True):
+        for offset, (split, colour) in zip((-0.2, 0.2), _COLOURS.items(), strict=True):
+            values = [similarity[name][key][split] for name in names]
+            axes.barh(place + offset, values, 0.4, color=colour, label=f"{_LABELS[split]} demonstrations")
+        unit = "deg" if key.endswith("_deg") else "chain lengths"
+        axes.set(title=header.replace("\n", " "), xlabel=unit)
+        axes.grid(alpha=0.3, axis="x")
+    all_axes[0].set_yticks(place, [SIMILARITY_NAMES.get(name, name.replace("_", " ")) for name in names])
+    all_axes[0].invert_yaxis()
+    _finish(
+        figure,
+        all_axes[0],
+        f"{title}: similarity of the motions (0 is identical), with baselines without learning",
+        out,
+    )
+
+
+def plot_arms(
+    arms: Mapping[str, Mapping[str, Any]], series: Mapping[str, str], out: Path, *, label: str, title: str
+) -> None:
+    """Plots metrics of each arm in percent, in one panel the arms that training has seen, in another the others.
+
+    Args:
+      arms: metrics of each arm by its name, and whether it was `seen`. An arm whose first metric is NaN is left out.
+      series: keys of the metrics with their labels; the arms are in the order of the first one.
+      out: file of the plot; not written where no arm is left.
+      label: of the values.
+      title: of the plot.
+    """
+    first = next(iter(series))
+    names = sorted((n for n in arms if np.isfinite(arms[n][first])), key=lambda name: arms[name][first])
+    parts = {seen: [name for name in names if arms[name]["seen"] == seen] for seen in (True, False)}
+    parts = {seen: part for seen, part in parts.items() if part}
+    if not parts:
+        return
+    widths = [max(_ARM_WIDTH * len(part), _MIN_WIDTH) for part in parts.values()]
+    figure, all_axes = plt.subplots(
+        1, len(parts), figsize=(sum(widths) + 1, 4.5), sharey=True, layout="constrained", squeeze=False,
+        width_ratios=widths,
+    )  # fmt: skip
+    for axes, (seen, part) in zip(all_axes[0], parts.items(), strict=True):
+        for (key, text), (marker, colour) in zip(series.items(), _MARKERS, strict=True):
+            percent = [100 * arms[name][key] for name in part]
+            axes.plot(range(len(part)), percent, marker, color=colour, label=text, markersize=5)
+        axes.set_yscale("symlog", linthresh=_LINEAR)
+        axes.set(title="arms seen in training" if seen else "unseen arms", xlim=(-0.7, len(part) - 0.3))
+        axes.set_xticks(range(len(part)), part, rotation=90, fontsize=8)
+        axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+        axes.grid(alpha=0.3)
+    all_axes[0, 0].set_ylabel(label)
+    figure.suptitle(title)
+    figure.legend(*all_axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
+    _save(figure, out)
 
 
 def _finish(figure: Any, labelled: Any, title: str, out: Path) -> None:

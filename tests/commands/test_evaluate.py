@@ -67,6 +67,7 @@ def test_holding_the_start_pose_has_a_gap_of_one(run_dir, tmp_path, monkeypatch)
         "quality.csv",
         "quality.png",
         "demonstrations.png",
+        "similarity.png",
     }
 
 

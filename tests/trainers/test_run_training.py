@@ -111,7 +111,7 @@ def test_evaluate_repeats_the_report(finished, tmp_path):
     out = tmp_path / "again"
     result = command("evaluate", f"run={run_dir}", f"out={out}")
     assert result.returncode == 0, result.stderr[-2000:]
-    pictures = {"quality.png", "demonstrations.png"}
+    pictures = {"quality.png", "demonstrations.png", "similarity.png"}
     tables = {"demonstrations.csv", "quality.csv", "config.yaml"}
     assert {path.name for path in out.iterdir()} == {"report.json", *tables, *pictures}
     again, report = (json.loads((folder / "report.json").read_text()) for folder in (out, run_dir))
