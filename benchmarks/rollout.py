@@ -3,22 +3,27 @@
     python -m benchmarks.rollout --out FILE [--envs panda7dof ...] [--arms 512 8192 ...] [--cases fused mjx ...]
 
 Every case makes control steps of 0.1 s under random torques. The physics of the environments, `fused` and `mjx`, is
-compared with a loop that carries `mjx.Data`; whole environment steps with the stock one, which also resets it.
+compared with a loop that carries `mjx.Data`, and with C MuJoCo's threaded rollout on the CPU; whole environment steps
+with the stock one, which carries and resets `mjx.Data`, as brax environments usually do.
 """
 
 import itertools
+import os
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
 from mujoco import mjx
 
 import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect, failure
-from benchmarks.common.timing import Timing, time_program
+from benchmarks.common.timing import Timing, time_call, time_program
 from benchmarks.peers import stock
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import wrap_for_training
@@ -67,6 +72,17 @@ def carried_data(env: ImitationEnv, arms: int) -> Timing:
     return time_steps(step, data, torques)
 
 
+def mujoco_threads(env: ImitationEnv, arms: int) -> Timing:
+    model = stock.model_with_substeps(env)
+    threads = [mujoco.MjData(model) for _ in range(os.cpu_count() or 1)]
+    qpos, qvel, torques = (np.asarray(x, float) for x in random_motion(env, arms))
+    state = np.hstack([np.zeros((arms, 1)), qpos, qvel])  # time is first
+    control = np.repeat(torques.swapaxes(0, 1), env.config.substeps, axis=1)
+    applied = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+    with mujoco.rollout.Rollout(nthread=len(threads)) as pool:
+        return time_call(lambda: pool.rollout(model, threads, state, control, control_spec=applied))
+
+
 def environment(kind: str, env: ImitationEnv, arms: int) -> Timing:
     """A whole environment step with new episodes, by a physics of the environments or "stock"."""
     horizon = env.config.horizon + 1
@@ -89,6 +105,7 @@ CASES: dict[str, dict[str, Case]] = {
         "fused": partial(own_physics, "fused"),
         "mjx": partial(own_physics, "mjx"),
         "mjx.Data carried": carried_data,
+        "C MuJoCo, all cores": mujoco_threads,
     },
     "environment": {kind: partial(environment, kind) for kind in ("fused", "mjx", "stock")},
 }

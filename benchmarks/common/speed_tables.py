@@ -110,6 +110,7 @@ def physics(rollout: Results) -> list[Cells]:
         "`env.physics=fused`": ("fused", "fused"),
         "`env.physics=mjx`": ("mjx", "mjx"),
         "`mjx.Data` carried from step to step, reset by brax's wrappers": ("mjx.Data carried", "stock"),
+        "C MuJoCo, all cores": ("C MuJoCo, all cores", ""),
     }
     rows: list[Cells] = [("", "physics, steps/s", "environment steps/s", "device memory of an arm")]
     for name, (case, environment) in names.items():
