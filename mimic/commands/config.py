@@ -386,6 +386,7 @@ class ViewConfig:
 
     Attributes:
       env: environment that defines the arms and the metric.
+      run: run directory of a policy to play. Its arms and demonstrations are used.
       source: tcp://localhost:PORT, a socket of this machine that takes points of a person, who is the expert, or poses
         of a hand as lines of JSON.
       demonstrations: file of the expert's demonstrations to choose from. Default "": random ones are recorded.
@@ -394,12 +395,15 @@ class ViewConfig:
       record: new folder for what the hand drives, a LeRobot data set, written at the end. Default "": none.
       arm: "left" or "right" arm of the person in `source`. Default "": right.
       capture: how these points are read.
+      checkpoint: steps of the checkpoint of the policy. Default None: the last checkpoint.
+      split: "held_out" or "train": demonstrations of the run to show first.
       host: address of the server; 0.0.0.0 is every address of this machine.
       port: port of the server.
       compilation_cache: see `TrainConfig`.
     """
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
+    run: str = ""
     source: str = ""
     demonstrations: str = ""
     hand: str = "free"
@@ -407,19 +411,24 @@ class ViewConfig:
     record: str = ""
     arm: str = ""
     capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
+    checkpoint: int | None = checkpoint_number()
+    split: str = "held_out"
     host: str = "127.0.0.1"
     port: int = number(8080, at_least=1, at_most=65_535)
     compilation_cache: str = "~/.cache/mimic/jax"
 
     def __post_init__(self) -> None:
         check_ranges(self)
+        check_choice("split", self.split, SPLITS)
         if self.source:
-            check_unused(self, ("demonstrations",), "with source=, whose person is the expert")
+            check_unused(self, ("run", "demonstrations"), "with source=, whose person is the expert")
         else:
             check_unused(self, ("arm", "capture"), "without source=")
         if self.arm:
             check_choice("arm", self.arm, ARM_SIDES)
         check_choice("hand", self.hand, _FOLLOWED)
+        if self.run:
+            check_unused(self, ("demonstrations", "hand", "record"), "with run=, whose policy moves the learner")
         if self.base != "same" and (self.hand == "free" or base_numbers(self.base) is None):
             raise ValueError(
                 "base: expected same or [x,y,z,yaw] with hand=exact or relative; inspect base=auto finds one"

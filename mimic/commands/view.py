@@ -1,4 +1,4 @@
-"""`python -m mimic.view`: serves a live view until it is interrupted."""
+"""`python -m mimic.view`: serves a live view or the playback of a policy until it is interrupted."""
 
 import contextlib
 import functools
@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import jax
+from rich.console import Console
 
+from mimic.base import compat
 from mimic.base.config import new_folder
 from mimic.base.distribution import import_extra
 from mimic.commands.arm_keys import check_no_arms
@@ -26,6 +28,8 @@ from mimic.envs.config import EnvConfig
 from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.episodes import EXTRA
 from mimic.motions.mocap.live_hand import LiveHand
+from mimic.runs.checkpoints import load_checkpoint
+from mimic.trainers.run_config import policy_run
 from mimic.viewer.hand_following import HandSettings
 from mimic.viewer.history import RATE
 from mimic.viewer.live_session import LiveSession
@@ -33,20 +37,22 @@ from mimic.viewer.live_session import LiveSession
 if TYPE_CHECKING:
     from mimic.viewer.controls import ExpertControls
     from mimic.viewer.page import Page
+    from mimic.viewer.playback import Playback
 
 CAPTURE_RATE = 100.0  # frames per second of a captured person, at most
 _NUMBERS_RATE = 15.0  # per second, of the numbers, chart and maps, which cost a browser more than the arms
 
 
 def prepare_view(config: ViewConfig, overrides: Sequence[str] = ()) -> Callable[[], int]:
-    """Checks the config of a view and loads its arms.
+    """Checks the config of a view and loads its arms or its policy.
 
     Args:
       config: of the view.
       overrides: of the command line, of which those without effect are rejected.
 
     Raises:
-      ValueError: viser is not installed, the port is in use, the arms are invalid, or an override has no effect.
+      ValueError: viser is not installed, the port is in use, the arms or the run are invalid, or an override has no
+        effect.
     """
     import_extra("viser", "view", "view")
     check_port(config.host, config.port)
@@ -56,6 +62,9 @@ def prepare_view(config: ViewConfig, overrides: Sequence[str] = ()) -> Callable[
     from mimic.base.compilation import use_compilation_cache
 
     use_compilation_cache(config.compilation_cache)
+    if config.run:
+        check_no_arms(overrides, "with run=")
+        return _prepare_playback(config)
     # Poses take less than it takes to wake a thread of XLA's up, which on busy cores has to wait for its turn.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     config.env.check_one_learner()
@@ -100,7 +109,7 @@ def _serve_session(
         show_live(page, times, session, env, expert(), numbers_rate)
 
     after = functools.partial(_finish, config, session)
-    return serve(config, env, show_session, after, rate)
+    return serve(config, env, _title(config, env), show_session, after, rate)
 
 
 def _session(config: ViewConfig, env: EnvConfig) -> LiveSession:
@@ -142,3 +151,42 @@ def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
                 return show(expert)
 
     return run
+
+
+def _prepare_playback(config: ViewConfig) -> Callable[[], int]:
+    """Prepares the playback of a checkpoint."""
+    compat.import_mjx()
+    from mimic.trainers.make import make_ppo_trainer
+    from mimic.viewer.playback import Playback
+
+    run_dir, trained = policy_run(config.run, config.checkpoint)
+    trained.env.check_one_learner()
+    trainer = make_ppo_trainer(trained, run_dir)
+    _, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
+
+    def run() -> int:
+        with Console().status("running the policy on all demonstrations and computing the kinematic bound"):
+            playback = Playback(trained.env, trainer.evaluator, trainer.evaluate(params))
+            _ = trainer.evaluator.lower_bound
+        play = functools.partial(_play, playback=playback, split=config.split)
+        return serve(config, trained.env, _title(config, trained.env), play)
+
+    return run
+
+
+def _play(page: "Page", times: Iterator[float], playback: "Playback", split: str) -> None:
+    from mimic.viewer.player import Player
+
+    player = Player(page.server, playback, split)
+    for dt in times:
+        if player.advance(dt):
+            episode = player.split, player.demonstration
+            time = player.timeline.time
+            frame, chart = playback.frame(*episode, time), playback.chart(*episode, time)
+            page.show(frame, chart, playback.note(*episode))
+
+
+def _title(config: ViewConfig, env: EnvConfig) -> str:
+    if config.run:
+        return f"{env.name}: the policy of {Path(config.run).name} moves the learner"
+    return "The optimiser moves the learner"

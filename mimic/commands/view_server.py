@@ -44,6 +44,7 @@ def check_port(host: str, port: int) -> None:
 def serve(
     config: ViewConfig,
     env: EnvConfig,
+    title: str,
     show: "Callable[[Page, Iterator[float]], None]",
     after: Callable[[], None] | None = None,
     rate: float = RATE,
@@ -68,7 +69,7 @@ def serve(
             expert = _name(env.expert, env), ArmShape(env.expert, env.limits, match.expert_colours)
             learner = _name(env.learner, env), ArmShape(env.learner, env.limits, match.learner_colours)
             is_flat = env.expert.model == env.learner.model == "planar"
-            page = Page(server, expert, learner, match, is_flat)
+            page = Page(server, expert, learner, match, title, is_flat)
             print(f"view: {address(config.host, server.get_port())}   (Ctrl-C ends it)", flush=True)
             show(page, ticks(signals, rate))
         finally:

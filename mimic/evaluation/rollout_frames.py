@@ -30,6 +30,8 @@ class RolloutFrames:
       time: [frames] [s].
       expert, learner: [frames, joints] [rad].
       distance, bound, hold: [T] distance, kinematic bound and distance of holding the start pose after each step.
+      links: [T, expert links, learner links] weighted distance of every pair of links.
+      matrix: [T, expert links, learner links] correspondence.
       by_link: [T, learner links] part of each learner link in the distance.
     """
 
@@ -47,8 +49,10 @@ class RolloutFrames:
         self.learner = interpolate(qpos, qvel, dt, self.time)
         self.distance = np.asarray(rollouts.distance[index])
         self.bound, self.hold = evaluator.lower_bound[index], evaluator.hold_distance[index]
-        self.by_link = _by_link(evaluator, index, qpos[1:], qvel[1:])
+        self.links, self.matrix = _links(evaluator, index, qpos[1:], qvel[1:])
+        self.by_link = (self.matrix * self.links).sum(axis=1) / self.links[0].size
         self.link_names = env.learner.link_names
+        self.num_frames = len(self.time)
 
 
 def interpolate(
@@ -60,13 +64,14 @@ def interpolate(
     return CubicHermiteSpline(dt * np.arange(len(qpos)), qpos, qvel)(time)
 
 
-def _by_link(evaluator: Evaluator, index: int, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-    """Part of each learner link in the distance after each step, [T, learner links]."""
+def _links(evaluator: Evaluator, index: int, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Link distances D' and correspondence W after each step, [T, expert links, learner links] each."""
     env = evaluator.env
 
-    def at_step(qpos: jax.Array, qvel: jax.Array, step: jax.Array) -> jax.Array:
+    def at_step(qpos: jax.Array, qvel: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
         learner = link_states(env.learner, qpos, qvel)
         distances = env.metric.link_distances(env.expert_at(jnp.asarray(index), step), learner)
-        return (env.metric.matrix(distances) * distances).sum(axis=0) / distances.size
+        return distances, env.metric.matrix(distances)
 
-    return np.asarray(jax.jit(jax.vmap(at_step))(qpos, qvel, jnp.arange(1, len(qpos) + 1)))
+    links, matrix = jax.jit(jax.vmap(at_step))(qpos, qvel, jnp.arange(1, len(qpos) + 1))
+    return np.asarray(links), np.asarray(matrix)

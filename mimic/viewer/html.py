@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from mimic.evaluation.labels import similarity_texts
 
-EXPERT, LEARNER, BOUND = "#3b6fd4", "#1b9e77", "#222222"
+EXPERT, LEARNER, BOUND, HOLD = "#3b6fd4", "#1b9e77", "#222222", "#9a9a9a"
 _BLUES, _ORANGES = (8, 69, 148), (200, 80, 10)
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 360, 96, 34, 18, 8  # pixels of a chart and its margins
 LAST = 1e12  # order of an element below all others, whose orders are times in seconds

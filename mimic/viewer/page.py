@@ -21,7 +21,6 @@ EXPERT_BASE, _LEARNER = "/expert/base", "/learner"  # base frame of the expert, 
 _GOAL_SIZE, _GOAL_BALL = 0.12, 0.035  # axes of a goal of the hand, and the ball in it, in chain lengths
 _STATE_COLOURS = {"tracking": (60, 170, 80), "nearest": (215, 40, 40)}  # of the ball by the state of a hand
 _OTHER_STATE = (240, 160, 30)
-_TITLE = "The optimiser moves the learner"
 _PANEL_WIDTH = 384.0  # pixels; the heat maps of two arms with seven joints fit
 
 
@@ -32,6 +31,7 @@ class Page:
       server: new server without elements.
       expert, learner: name and meshes of each.
       match: which of their links correspond.
+      title: title of the page.
       is_flat: whether the camera looks from above.
 
     Attributes:
@@ -44,6 +44,7 @@ class Page:
         expert: tuple[str, ArmShape],
         learner: tuple[str, ArmShape],
         match: LinkMatch,
+        title: str,
         is_flat: bool,
     ):
         self.server, shapes = server, (expert[1], learner[1])
@@ -54,7 +55,7 @@ class Page:
         self._learner = _DrawnArm(server, _LEARNER, shapes[1], right, f"learner: {learner[0]}", label_at)
         self._ghost = _Ghost(server, shapes[1], match)
         self._goals = _HandGoals(server, shapes[1], len(match.learner.hand_joint))
-        self._title = html.title(_TITLE)
+        self._title = html.title(title)
         self._numbers = server.gui.add_html("")
         self.show_note("compiling …")
         self._chart = server.gui.add_html("")

@@ -53,9 +53,15 @@ def test_a_run_of_one_learner_has_its_own(reason, tmp_path):
     )
 
 
-def test_a_video_shows_one_arm(config_alone, reason):
-    message = "learner: expected one arm for a run of many, env=panda_family, as in learner=panda locked=[2,4]"
-    assert message in reason("render", f"run={config_alone}")
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("view", "expected an environment of one learner, got"),
+        ("render", "learner: expected one arm for a run of many, env=panda_family, as in learner=panda locked=[2,4]"),
+    ],
+)
+def test_what_shows_one_arm_rejects_many(config_alone, reason, command, message):
+    assert message in reason(command, f"run={config_alone}")
 
 
 @pytest.mark.slow

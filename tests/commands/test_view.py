@@ -30,10 +30,12 @@ from tests.helpers.bodies import person
     [
         (["host=nowhere.invalid"], "host: expected an address of this machine"),
         (["learner=missing.xml"], "no MJCF or URDF file at"),
+        (["run=a", "learner=panda"], "learner: expected none with run=, which brings its own"),
+        (["run=a", "env=panda3dof"], "env: expected none with run=, which brings its own"),
         (["source=tcp://localhost:9000", "expert=panda"], "expert: expected none with source=, which brings its own"),
         (["hand=near"], "hand: expected one of free, exact, relative, got 'near'"),
         (["base=[0,0,0,1]"], "base: expected same or [x,y,z,yaw] with hand=exact or relative"),
-        (["demonstrations=a.npz", "source=tcp://localhost:9000"], "demonstrations: expected none with source="),
+        (["demonstrations=a.npz", "run=b"], "demonstrations: expected none with run="),
         (["demonstrations=missing.npz"], "missing.npz"),
         (["capture.yaw=3"], "capture: expected none without source="),
         (["source=tcp://localhost:9000", "arm=middle"], "arm: expected one of left, right, got 'middle'"),
@@ -85,7 +87,7 @@ def test_ticks_end_with_a_signal():
 def test_a_view_that_others_can_reach_says_so(host, warned, capsys):
     config = ViewConfig(env=env_config("planar4dof"), host=host, port=free_port())
     shown = []
-    assert view_server.serve(config, config.env, lambda page, times: shown.append(page)) == 0
+    assert view_server.serve(config, config.env, "planar", lambda page, times: shown.append(page)) == 0
     output = capsys.readouterr()
     assert shown and f"view: http://127.0.0.1:{config.port}" in output.out and "view: ended\n" in output.out
     assert ("everyone who can reach this machine" in output.err) == warned

@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mimic.envs import env_config
+from mimic.trainers import run_training as train
+from mimic.trainers.config import PPOConfig, TrainConfig
 from tests.helpers.commands import free_port
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -146,3 +149,29 @@ def settled(page):
         if (now := page.inner_text("#mimic-distance")) != shown:
             shown, since = now, time.monotonic()
     return shown
+
+
+def test_a_policy_plays_and_can_be_scrubbed(page, serve, tmp_path):
+    page, complaints = page
+    tiny = {"num_envs": 64, "batch_size": 32, "num_minibatches": 4, "num_updates_per_batch": 1, "hidden_layers": [16]}
+    env = env_config("planar4dof", demonstrations={"count": 1, "held_out": 2})
+    settings = PPOConfig(**tiny, num_timesteps=2000, evaluations=1)
+    config = TrainConfig(env, settings, run_dir=str(tmp_path / "run"), compilation_cache="")
+    assert train.prepare_training(config, 0.0)() == 0
+    page.goto(serve(f"run={tmp_path / 'run'}"))
+    page.wait_for_function("(document.querySelector('#mimic-note')?.innerText ?? '').includes('gap')", timeout=LATEST)
+    playing = {page.inner_text("#mimic-distance") for _ in range(20) if not time.sleep(0.1)}
+    assert len(playing) > 3
+    page.screenshot(path=tmp_path / "playing.png")
+    page.get_by_role("button", name="pause").click()
+    paused = settled(page)
+    scrub = page.get_by_role("slider").first
+    scrub.focus()
+    for _ in range(12):
+        scrub.press("ArrowLeft")
+    other = "before => document.querySelector('#mimic-distance').innerText !== before"
+    page.wait_for_function(other, arg=paused, timeout=LATEST)
+    assert settled(page) != paused
+    page.screenshot(path=tmp_path / "scrubbed.png")
+    print(f"screenshots: {tmp_path}")
+    assert not complaints

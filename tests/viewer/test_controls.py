@@ -1,6 +1,7 @@
 """The controls of a live view on a page: which joints are locked, and what is drawn of it."""
 
 import importlib.util
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from mimic.envs import env_config
 from mimic.viewer.controls import LiveControls
 from mimic.viewer.live_session import Frame, LiveSession
 from mimic.viewer.manual_controls import ManualControls
+from mimic.viewer.timeline import TimeControls, Timeline
 from tests.helpers.commands import free_port
 
 
@@ -27,7 +29,7 @@ def serve():
             show(page, config)
             done.append(True)
 
-        assert view_server.serve(config, config.env, show_once) == 0 and done
+        assert view_server.serve(config, config.env, "arms", show_once) == 0 and done
 
     return serve_once
 
@@ -45,5 +47,28 @@ def test_locked_joints_are_checked_named_and_marked(serve):
         for locked in ((), ("joint4",)):
             page.move(Frame(angles, angles, locked, (), (), 0.1, 0.1, np.eye(1), np.eye(1), {}))
             assert {name for name, mark in page._learner._marks.items() if mark.visible} == set(locked)
+
+    serve(show)
+
+
+def test_the_slider_of_a_time_stops_where_the_time_does(serve):
+    def show(page, config):
+        timeline = Timeline(1.03)
+        timeline.repeats = False
+        controls = TimeControls(page.server, timeline)
+
+        def play(steps):
+            for _ in range(steps):
+                timeline.advance(0.02)
+                controls.update(0.02)
+            return controls._scrub.value
+
+        assert play(100) == 1.03 and not timeline.is_playing and controls._button.label == "play"
+        controls._set_playing(True)
+        play(10)
+        controls._set_playing(False)
+        assert play(1) == 0.2
+        controls._scrubbed(SimpleNamespace(client=object(), target=SimpleNamespace(value=0.5)))
+        assert timeline.time == 0.5 and play(1) == 0.2  # the browser moved it itself
 
     serve(show)

@@ -176,5 +176,5 @@ def test_the_page_has_a_handle_a_tab_and_goals(env):
         page.move(dataclasses.replace(frame, hand=None))
         assert page._ghost._root.visible and not goals._axes[0].visible
 
-    assert view_server.serve(config, env, show) == 0
+    assert view_server.serve(config, env, "arms", show) == 0
     assert done[0] != done[1]
