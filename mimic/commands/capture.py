@@ -9,10 +9,11 @@ import numpy as np
 from rich.console import Console
 
 from mimic.arms.arm import ArmConfig
-from mimic.arms.embodiment import Embodiment
+from mimic.arms.embodiment import Embodiment, load_mjcf
 from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.base.overrides import setting, shell_words
 from mimic.commands.config import CaptureConfig, RecordingConfig
+from mimic.commands.demonstrations_plot import plot_demonstrations
 from mimic.commands.printed import train_command
 from mimic.envs.config import DemonstrationConfig, EnvConfig, RewardConfig
 from mimic.metric.kinematics import link_state_table
@@ -130,8 +131,8 @@ def fixed_fraction(arm: Embodiment) -> float:
     return float(np.mean([still[list(chain)].sum() for chain in arm.chains]) / arm.chain_length)
 
 
-def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path) -> Callable[[], None]:
-    """Reads and cuts a captured motion; the returned function writes the demonstrations and the arm.
+def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Path) -> Callable[[], None]:
+    """Reads and cuts a captured motion; the returned function writes the demonstrations, the arm and a plot.
 
     Raises:
       ValueError: what `read_arm` and `windows` reject.
@@ -158,8 +159,12 @@ def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path) -> Calla
         console = Console()
         model.write_text(xml)
         cut.demonstrations.save(out)
+        length = env.horizon * env.control_dt / slow_down
+        title = f"{source.name}, {parts[0].name}: {len(cut.start)} windows of {length:.2f} s"
+        plot_demonstrations(cut.demonstrations, load_mjcf(model, tip=[ALL_ENDS]), plot, title=title)
         for line in [*body_lines(capture.body), *_capture_lines(capture, cut, env)]:
             console.print(line, soft_wrap=True, highlight=False, markup=False)
+        console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
         console.print(f"results: {out}, {model}", soft_wrap=True, highlight=False)
         expert = ArmConfig(model=str(model), tip=[ALL_ENDS] if config.arm == BOTH else None)
         demonstrations = DemonstrationConfig(path=str(out), count=cut.training, held_out=cut.held_out)

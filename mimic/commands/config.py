@@ -245,7 +245,7 @@ class RecordingConfig:
       rate: samples per second of a table or of HDF5 files in `source`. Default None: stated there.
       arm: "left" or "right" arm of the person in a motion capture file `source`, or "both". Default "": right.
       capture: how such a file is read and cut.
-      out: .npz file of the demonstrations; must not exist.
+      out: .npz file of the demonstrations, with the plot beside it as .png; neither may exist.
     """
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)

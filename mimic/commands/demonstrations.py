@@ -16,6 +16,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.base.config import check_unused, new_file
 from mimic.commands.capture import MOTION_CAPTURE, prepare_capture
 from mimic.commands.config import RecordingConfig
+from mimic.commands.demonstrations_plot import plot_demonstrations
 from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import recorded_demonstrations
 from mimic.motions.demonstrations import Demonstrations, check_effort
@@ -31,39 +32,43 @@ _NOT_RECORDED = "with source=FILE, whose motions are not recorded"
 
 
 def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
-    """Checks the config and records or imports the demonstrations; the returned function writes them.
+    """Checks the config and records or imports the demonstrations; the returned function writes and plots them.
 
     Recording is part of the check: only the recording shows whether the arm's limits permit any goal.
 
     Raises:
       ValueError: a file exists or its folder does not, the arm is invalid, or its limits permit no goal.
     """
-    out = _file(config)
+    out, plot = _files(config)
     env, console = config.resolve(), Console()
     if config.source and (config.arm or Path(config.source).suffix.lower() in MOTION_CAPTURE):
         check_unused(config, ("kind", "count", "seed", "limits", *_OF_SOURCE), _NOT_RECORDED)
-        return prepare_capture(config, env, out)
+        return prepare_capture(config, env, out, plot)
     with errors_of("expert"):
         arm = build_arm(env.expert, env.limits)
     if config.source:
-        return _prepare_import(config, env, arm, out)
+        return _prepare_import(config, env, arm, out, plot)
     check_unused(config, (*_OF_SOURCE, "arm", "capture"), "without source=FILE")
     demonstrations, redrawn = _record(arm, env, console)
     check_effort(demonstrations, arm.embodiment)  # of the exact arrays to be written
 
     def run() -> None:
         demonstrations.save(out)
+        recording = env.demonstrations
+        title = f"{arm.embodiment.name}, {recording.kind} demonstrations: {recording.count}, seed {recording.seed}"
+        plot_demonstrations(demonstrations, arm.embodiment, plot, title=title)
         console.print(_table(demonstrations, arm.embodiment))
         console.print(_limits_line(arm.embodiment), soft_wrap=True, highlight=False)
         _print_clearance(console, env, arm, demonstrations)
         console.print(f"goals redrawn because a limit was exceeded: {redrawn}", highlight=False)
+        console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
 
 
-def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path) -> Callable[[], None]:
-    """Imports motions; the returned function writes them."""
+def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path, plot: Path) -> Callable[[], None]:
+    """Imports motions; the returned function writes and plots them."""
     check_unused(config, ("kind", "count", "seed"), _NOT_RECORDED)
     check_unused(config, ("capture",), "with a source of joint angles")
     source = Path(config.source).expanduser()
@@ -90,11 +95,13 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
     def run() -> None:
         console = Console()
         imported.save(out)
+        plot_demonstrations(imported, arm.embodiment, plot, title=f"{arm.embodiment.name}, {source.name}")
         console.print(_table(imported, arm.embodiment))
         length = f"{imported.horizon} steps of {imported.dt:g} s"
         for line in [f"{source.name}: {imported.count} demonstrations, {length}", *notes, *_gripper_lines(imported)]:
             console.print(line, soft_wrap=True, highlight=False, markup=False)
         _print_clearance(console, env, arm, imported)
+        console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
@@ -131,12 +138,12 @@ def _print_clearance(console: Console, env: EnvConfig, arm: Arm, demonstrations:
     console.print(touching_line(clearances), soft_wrap=True, highlight=False)
 
 
-def _file(config: RecordingConfig) -> Path:
-    """The new file of the demonstrations."""
+def _files(config: RecordingConfig) -> tuple[Path, Path]:
+    """The new files of the demonstrations and, beside it, of their plot."""
     out = new_file("out", config.out)
     if out.suffix != ".npz":
         raise ValueError(f"out: expected a file that ends in .npz, got {str(out)!r}")
-    return out
+    return out, new_file("out", str(out.with_suffix(".png")))
 
 
 def _record(arm: Arm, env: EnvConfig, console: Console) -> tuple[Demonstrations, int]:

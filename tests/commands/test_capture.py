@@ -54,6 +54,7 @@ def test_demonstrations_fit_the_arm_that_is_written_with_them(written):
     assert arm.link_lengths[0] / arm.chain_length == pytest.approx(column, rel=1e-3)
     slow_down = slow_down_for([arm_motion(person(900), "left")], 2.0)
     assert f"time: {slow_down:.2f} times as long" in printed
+    assert (folder / "left.png").stat().st_size > 10_000
 
 
 @pytest.fixture(scope="module")

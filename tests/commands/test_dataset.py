@@ -108,7 +108,8 @@ def test_a_split_of_a_run(run_dir, written, tmp_path):
         np.testing.assert_array_equal(held_out[name], both[name][COUNT:])
 
 
-def test_demonstrations_come_back_from_a_dataset(recorded, tmp_path):
+def test_demonstrations_come_back_from_a_dataset(recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr("mimic.commands.demonstrations.plot_demonstrations", lambda *_, **__: None)
     dataset = write(tmp_path / "set", demonstrations=str(recorded))
     text = run("demonstrations", f"source={dataset}", f"out={tmp_path / 'back.npz'}")
     assert (

@@ -21,7 +21,7 @@ def test_the_command_records_what_the_library_does(tmp_path):
     printed = run("demonstrations", "kind=pid", "count=3", "seed=5", f"out={out}")
     assert "all stay within the torque limits and velocity limits of panda" in printed
     assert printed.endswith(f"results: {out}\n")
-    assert {path.name for path in tmp_path.iterdir()} == {"demonstrations.npz"}
+    assert {path.name for path in tmp_path.iterdir()} == {"demonstrations.npz", "demonstrations.png"}
     loaded, expected = mimic.load_demonstrations(out), mimic.record_demonstrations(panda(), 3, kind="pid", seed=5)
     for field in dataclasses.fields(mimic.Demonstrations):
         np.testing.assert_array_equal(getattr(loaded, field.name), getattr(expected, field.name))
@@ -32,6 +32,7 @@ def test_the_command_records_what_the_library_does(tmp_path):
     [
         (["out={taken}"], "exists; name a new file"),
         (["out=new.txt"], "expected a file that ends in .npz"),
+        (["out={folder}/drawn.npz"], "drawn.png' exists; name a new file"),
         (
             ["out=new.npz", "kind=dance"],
             "expected one of computed_torque, pid, reach, splines, steps, mixed, got 'dance'",
@@ -58,6 +59,7 @@ def test_bad_input_of_the_command(reason, tmp_path, arguments, message):
     paths = {name: tmp_path / file for name, file in files.items()}
     np.savez(paths["recorded"], format=FORMAT)
     paths["taken"].write_text("")
+    (tmp_path / "drawn.png").write_text("")
     paths["csv"].write_text("time,joint1\n0,0\n")
     assert message in reason("demonstrations", *(argument.format(**paths) for argument in arguments))
 
