@@ -27,7 +27,7 @@ from mimic.retargeting.pose import shared_joints
 from mimic.retargeting.pose_baselines import copy_joints
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.files import REPORT
-from mimic.trainers.config import TRAINERS as CONFIGS
+from mimic.trainers.config import BUILT_IN_TRAINERS as CONFIGS
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.make import make_trainer
 from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer

@@ -186,7 +186,7 @@ def reason(monkeypatch, tmp_path, schemas):
         from mimic.base.config import to_dict, typed
         from mimic.commands import cli
         from mimic.envs import env_config
-        from mimic.trainers.config import TRAINERS
+        from mimic.trainers.config import trainer_config
 
         prepare = importlib.import_module(f"mimic.{name}").prepare
         monkeypatch.setattr(cli, "overrides", lambda: list(arguments))
@@ -200,7 +200,7 @@ def reason(monkeypatch, tmp_path, schemas):
                 preset["env"] = to_dict(env_config(settings.pop("env")))
             if name == "train":
                 trainer = settings.pop("trainer", "ppo")
-                preset["trainer"] = OmegaConf.merge(schemas(TRAINERS[trainer]), {"name": trainer})
+                preset["trainer"] = OmegaConf.merge(schemas(trainer_config(trainer)), {"name": trainer})
             schema = schemas(typing.get_type_hints(prepare)["config"])
             given = OmegaConf.from_dotlist([f"{key}={value}" for key, value in settings.items()])
             prepare(typed(DictConfig(OmegaConf.merge(schema, preset, given))))

@@ -46,7 +46,7 @@ from mimic.runs.signals import STOPPED_BY_SIGNAL, ended_without_reader, watched_
 from mimic.runs.sweeps.hydra_plugins import bound_config_files
 from mimic.runs.sweeps.launchers import check_launcher, register_launchers
 from mimic.runs.sweeps.sweeper import FAILED, Outcome, register_sweeper
-from mimic.trainers.config import TRAINERS, TrainConfig
+from mimic.trainers.config import TrainConfig, trainer_config, trainers
 from mimic.trainers.export.config import ExportConfig
 
 _SWITCH_INTERVAL = 5e-4  # s; with Python's 5 ms, a loop of short numpy calls starves beside threads that compile
@@ -266,8 +266,10 @@ def _register_schemas() -> None:
     store.store(name="retarget_schema", node=schema(RetargetConfig))
     store.store(name="view_schema", node=schema(ViewConfig))
     store.store(group="env", name="schema", node=schema(EnvConfig))
-    for name, config in TRAINERS.items():
-        store.store(group="trainer", name=f"{name}_schema", node=schema(config))
+    for name in trainers():
+        store.store(group="trainer", name=f"{name}_schema", node=schema(trainer_config(name)))
+    for name in registry.names("trainer"):
+        store.store(group="trainer", name=name, node={"defaults": [f"{name}_schema", "_self_"], "name": name})
     for name in registry.names("environment"):
         store.store(group="env", name=name, node={"defaults": ["schema", "_self_"], **registered_preset(name)})
 

@@ -15,7 +15,7 @@ from mimic.evaluation.labels import SPLITS
 from mimic.physics.world import PHYSICS
 from mimic.retargeting.costs import Costs
 from mimic.retargeting.hand_target import placement
-from mimic.trainers.config import TRAINERS
+from mimic.trainers.config import trainers
 
 ROBOT_WORLDS = ("nominal", "hardware")
 ROBOTS = ("virtual_panda", "virtual_robot")
@@ -184,7 +184,7 @@ class CollectConfig:
 
     def __post_init__(self) -> None:
         if self.only:
-            check_choice("only", self.only, tuple(TRAINERS))
+            check_choice("only", self.only, trainers())
 
 
 @dataclasses.dataclass(frozen=True)

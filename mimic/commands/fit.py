@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from mimic.base.compilation import compilation_cache, use_compilation_cache
-from mimic.base.config import check_choice, explain, merged, schema, typed
+from mimic.base.config import explain, merged, schema, typed
 from mimic.base.files import open_file
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_report
@@ -25,7 +25,7 @@ from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.files import DEMONSTRATIONS, read_report
 from mimic.runs.signals import Signals
 from mimic.runs.stopwatch import Stopwatch
-from mimic.trainers.config import TRAINERS, TrainConfig, TrainerConfig
+from mimic.trainers.config import TrainConfig, TrainerConfig, trainer_config, trainers
 from mimic.trainers.make import make_trainer
 from mimic.trainers.report import show_report
 from mimic.trainers.run_config import load_config, new_run_dir
@@ -93,7 +93,7 @@ class Run:
 
         Args:
           quiet: whether to print nothing.
-          options: fields of `EvaluateConfig`, such as `physics="mjx"` or `controller="pd"`.
+          options: fields of `EvaluateConfig`, such as `physics="mjx"`, `mass=1.2` or `controller="pd"`.
 
         Returns:
           The report.
@@ -185,8 +185,9 @@ def _check_demonstrations(env: ImitationEnv) -> None:
 
 def _trainer_config(trainer: str | Mapping[str, Any]) -> TrainerConfig:
     fields = {"name": trainer} if isinstance(trainer, str) else {"name": "ppo", **trainer}
-    check_choice("trainer", fields["name"], tuple(TRAINERS))
-    return _filled(TRAINERS[fields["name"]], fields, "trainer")
+    if fields["name"] not in trainers():
+        raise ValueError(f"trainer: expected one of {', '.join(trainers())}, got {fields['name']!r:.80}")
+    return _filled(trainer_config(fields["name"]), fields, "trainer")
 
 
 def _filled(config_class: type, fields: Mapping[str, Any], label: str) -> Any:

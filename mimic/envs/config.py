@@ -30,6 +30,7 @@ class DemonstrationConfig:
 
     Attributes:
       path: file of demonstrations; where empty, demonstrations are recorded in simulation.
+      source: registered function that makes the demonstrations, in place of a recording; only where `path` is empty.
       kind: what drives the expert of recorded demonstrations: "computed_torque", "pid" (paper), "reach", "splines",
         "steps", or "mixed", each of these in turn; see `record_demonstrations`.
       count: number of training demonstrations.
@@ -38,6 +39,7 @@ class DemonstrationConfig:
     """
 
     path: str = ""
+    source: str = ""
     kind: str = MIXED
     # A core records some hundred in a second.
     count: int = number(600, at_least=1, at_most=100_000)
@@ -46,8 +48,10 @@ class DemonstrationConfig:
 
     def __post_init__(self) -> None:
         check_choice("kind", self.kind, (*KINDS, MIXED))
-        if self.path and self.kind != MIXED:
-            raise ValueError(f"demonstrations.kind: expected none with a path, got {self.kind}")
+        if self.path and self.source:
+            raise ValueError("demonstrations: expected path or source, got both")
+        if (self.path or self.source) and self.kind != MIXED:
+            raise ValueError(f"demonstrations.kind: expected none with a path or source, got {self.kind}")
         check_ranges(self, "demonstrations.")
 
 
@@ -196,7 +200,8 @@ class EnvConfig:
             registry.check("observation_term", name, "observation.terms")
         if self.environment:
             registry.check("environment", self.environment, "environment")
-        recorded = 0 if self.demonstrations.path else self.demonstrations.count + self.demonstrations.held_out
+        is_recorded = not (self.demonstrations.path or self.demonstrations.source)
+        recorded = 0 if not is_recorded else self.demonstrations.count + self.demonstrations.held_out
         steps = recorded * self.horizon * self.recording_substeps
         if steps > _MAX_RECORDED_STEPS:
             raise ValueError(

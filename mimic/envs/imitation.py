@@ -490,18 +490,18 @@ def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple
     """The demonstrations of a config: the first `count` are for training, the next `held_out` for evaluation.
 
     Raises:
-      ValueError: a file that cannot be read, does not fit the expert, exceeds its limits, or has too few
+      ValueError: a file or source that cannot be read, does not fit the expert, exceeds its limits, or has too few
         demonstrations.
     """
     expert = expert or config.build_arm("expert")
     settings = config.demonstrations
-    if settings.path:
-        loaded = load_demonstrations(Path(settings.path).expanduser())
+    if settings.path or settings.source:
+        loaded, label = _demonstrations_of_others(config, expert)
         loaded.check_fits(expert.embodiment, config.control_dt, config.horizon)
         check_effort(loaded, expert.embodiment, RECORDED_SPEED if loaded.torque is None else 1.0)
         if loaded.count < settings.count + settings.held_out:
             raise ValueError(
-                f"demonstrations: {settings.path!r} has {loaded.count}, expected at least "
+                f"demonstrations: {label!r} has {loaded.count}, expected at least "
                 f"count + held_out = {settings.count} + {settings.held_out}"
             )
     else:
@@ -554,10 +554,21 @@ def test_demonstrations(config: EnvConfig) -> Demonstrations:
       ValueError: demonstrations that are not recorded, or an arm whose limits allow no goal.
     """
     settings = config.demonstrations
-    if settings.path:
+    if settings.path or settings.source:
         raise ValueError(
-            f"split: expected none where the demonstrations are those of {settings.path!r}, got test; "
-            "demonstrations=FILE evaluates others"
+            f"split: expected none where the demonstrations are those of {settings.path or settings.source!r}, got "
+            "test; demonstrations=FILE evaluates others"
         )
     expert = config.build_arm("expert")
     return recorded_demonstrations(config, expert, TEST_SETS * TEST_COUNT * len(KINDS), kind=MIXED, test=True)
+
+
+def _demonstrations_of_others(config: EnvConfig, expert: Arm) -> tuple[Demonstrations, str]:
+    """The demonstrations of a file or of a registered source, and its name."""
+    settings = config.demonstrations
+    if settings.path:
+        return load_demonstrations(Path(settings.path).expanduser()), settings.path
+    made = registry.find("demonstrations", settings.source, "demonstrations.source")(expert, config)
+    if not isinstance(made, Demonstrations):
+        raise ValueError(f"demonstrations: source {settings.source!r}: expected Demonstrations, got {made!r:.80}")
+    return made, settings.source

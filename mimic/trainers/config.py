@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Optional, Self, Type
 
 from omegaconf import MISSING
 
+from mimic.base import registry
 from mimic.base.config import check_choice
 from mimic.base.ranges import check_ranges, number, seed_number
 from mimic.envs import env_config, environments
@@ -283,7 +284,31 @@ class PoseMapperConfig(TrainerConfig):
 
 
 _Config = TypeVar("_Config", bound=TrainerConfig)
-TRAINERS: dict[str, type[TrainerConfig]] = {"ppo": PPOConfig, "pose_mapper": PoseMapperConfig}
+BUILT_IN_TRAINERS: dict[str, type[TrainerConfig]] = {"ppo": PPOConfig, "pose_mapper": PoseMapperConfig}
+registry.reserve("trainer", tuple(BUILT_IN_TRAINERS))
+
+
+def trainers() -> tuple[str, ...]:
+    """The names of the trainers, those of mimic first and then those that are registered."""
+    return (*BUILT_IN_TRAINERS, *registry.names("trainer"))
+
+
+def trainer_config(name: str) -> type[TrainerConfig]:
+    """The config class of a trainer.
+
+    Raises:
+      ValueError: an unknown trainer, or a registered one whose `config_class` is no frozen dataclass with that name.
+    """
+    if name in BUILT_IN_TRAINERS:
+        return BUILT_IN_TRAINERS[name]
+    config_class: Any = getattr(registry.find("trainer", name, "trainer.name"), "config_class", None)
+    is_config = isinstance(config_class, type) and issubclass(config_class, TrainerConfig)
+    if not (is_config and getattr(config_class, "name", None) == name):
+        raise ValueError(
+            f"trainer {name!r}: expected the attribute config_class, a frozen dataclass derived from TrainerConfig "
+            f"with the default name = {name!r}, got {config_class!r:.80}"
+        )
+    return config_class
 
 
 def _filled_in(config: _Config, values: dict[str, Any], **changes: Any) -> _Config:
@@ -298,7 +323,7 @@ class TrainConfig:
 
     Attributes:
       env: see `EnvConfig`.
-      trainer: config of one of `TRAINERS`.
+      trainer: config of one of `trainers()`.
       seed: random seed of networks, exploration and resets.
       run_dir: folder that the run writes to; runs/ENV-TRAINER-seedSEED-TIME where empty.
       resume: run directory of the run to continue.

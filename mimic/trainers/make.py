@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import jax
 
-from mimic.base import compat
+from mimic.base import compat, registry
 from mimic.envs.family import with_one_learner
 from mimic.motions.demonstrations import Demonstrations
 from mimic.trainers.config import TrainConfig
@@ -27,7 +27,12 @@ def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
     Raises:
       ValueError: a config that cannot be trained.
     """
-    return _MAKERS[config.trainer.name](config.resolve(jax.default_backend(), jax.device_count()), run_dir)
+    name = config.trainer.name
+    config = config.resolve(jax.default_backend(), jax.device_count())
+    if name in _MAKERS:
+        return _MAKERS[name](config, run_dir)
+    compat.import_mjx()  # first, and quietly: the trainer may import brax
+    return registry.find("trainer", name, "trainer.name")(config, run_dir)
 
 
 def make_ppo_trainer(

@@ -10,7 +10,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mimic.base.config import check_choice, check_new, check_writable, explain, flatten, merged, schema, to_dict, typed
+from mimic.base import registry
+from mimic.base.config import check_new, check_writable, explain, flatten, merged, schema, to_dict, typed
 from mimic.base.config_files import check_references, read_config
 from mimic.base.files import write_atomically
 from mimic.base.overrides import setting, shell_words
@@ -19,7 +20,7 @@ from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, DEMONSTRATIONS
 from mimic.runs.lock import LOCK
 from mimic.runs.parameters import OtherParameters
-from mimic.trainers.config import TRAINERS, PPOConfig, TrainConfig
+from mimic.trainers.config import PPOConfig, TrainConfig, trainer_config
 from mimic.trainers.run_models import MODELS, with_original_models, with_saved_models
 
 _OF_NETWORKS = (  # keys on which the sizes of a run's networks depend
@@ -76,7 +77,7 @@ def how_to_continue(run_dir: Path, config: TrainConfig) -> str:
 
 def run_schema(trainer: str) -> DictConfig:
     """The typed OmegaConf node of a run with this trainer."""
-    return merged(schema(TrainConfig), {"trainer": schema(TRAINERS[trainer])})
+    return merged(schema(TrainConfig), {"trainer": schema(trainer_config(trainer))})
 
 
 def load_config(run_dir: Path, key: str = "run_dir", *, saved_models: bool = True) -> TrainConfig:
@@ -106,7 +107,7 @@ def _read_config(run_dir: Path) -> TrainConfig:
             if not OmegaConf.is_dict(content[group]):
                 raise ValueError(f"{group}: expected keys and values, got {content[group]}")
         name = OmegaConf.select(content, "trainer.name")
-        check_choice("trainer.name", str(name), tuple(TRAINERS))
+        registry.check("trainer", str(name), "trainer.name")
         return typed(merged(run_schema(name), content)).resolve()
     except Exception as error:  # OmegaConf, YAML and our own checks each have their own types of error
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error

@@ -36,15 +36,18 @@ def module(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("corespondence", "x", double), "kind: expected one of correspondence, environment"),
+        (("corespondence", "x", double), "kind: expected one of correspondence, demonstrations, environment"),
         (("correspondence", "two words", double), "expected a name of letters"),
         (("correspondence", "a:b", double), "expected a name of letters"),
         (("correspondence", "overlap", double), "'overlap' is built in"),
         (("environment", "panda4dof", {}), "'panda4dof' is built in"),
+        (("trainer", "ppo", double), "'ppo' is built in"),
         (("correspondence", "x", [[1.0]]), r"expected a function \(expert, learner\)"),
     ],
 )
 def test_what_cannot_be_registered(arguments, message):
+    import mimic.trainers.config  # noqa: F401 - reserves the names of trainers
+
     with pytest.raises(ValueError, match=message):
         mimic.register(*arguments)
 
@@ -113,6 +116,7 @@ def test_a_bad_name_is_one_line(rejected, arguments, message):
     [
         ({"observation": {"terms": ["x"]}}, "observation.terms: expected one of distance_gradient, got 'x'"),
         ({"reward": {"terms": {"x": 1}}}, "reward.terms: expected one of self_collision, got 'x'"),
+        ({"demonstrations": {"source": "x"}}, "demonstrations.source: expected one of none, got 'x'"),
     ],
 )
 def test_an_unknown_name_lists_the_valid_ones(overrides, message):

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from mimic.__main__ import commands
 from mimic.commands import cli
 from mimic.commands.key_help import explanations, key_lines
-from mimic.trainers.config import TRAINERS
+from mimic.trainers.config import BUILT_IN_TRAINERS
 from mimic.trainers.presets import MAPPER_PRESETS, PPO_PRESETS
 
 
@@ -32,7 +32,7 @@ def test_every_key_has_an_explanation(name, schemas):
         assert line.endswith(":") or re.search(r": .*  # \w|: +# \w|  # \S", line), line
 
 
-@pytest.mark.parametrize("config_class", TRAINERS.values())
+@pytest.mark.parametrize("config_class", BUILT_IN_TRAINERS.values())
 def test_every_key_of_a_trainer_is_documented(config_class):
     assert {field.name for field in dataclasses.fields(config_class)} == set(explanations(config_class))
 

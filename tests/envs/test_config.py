@@ -26,6 +26,7 @@ def test_arms_and_world_choose_the_kind():
         ("any_arm", {"control": "joint_velocity"}, "control: expected torque without an inner loop, got joint_vel"),
         ("panda4dof", {"world": "nominal", "substeps": 20}, "substeps: expected none with an inner loop, .*, got 20"),
         ("panda4dof", {"limit_weight": 2.0}, "limit_weight: expected with limits=hardware, got 2.0"),
+        ("panda4dof", {"demonstrations": {"path": "a.npz", "source": "b"}}, "expected path or source, got both"),
         (
             "panda4dof",
             {"demonstrations": {"path": "a.npz", "kind": "pid"}},

@@ -118,6 +118,7 @@ def test_ending_an_episode_early_is_never_better(own_registry, monkeypatch):
     [
         ("reward_term", lambda env, t: t.after.qpos, {"reward": {"terms": {"bad": 1.0}}}, r"a number, got shape \[4\]"),
         ("reward_term", lambda env, t: t.speed, {"reward": {"terms": {"bad": 1.0}}}, "reward_term 'bad': AttributeErr"),
+        ("demonstrations", lambda expert, config: None, {"demonstrations": {"source": "bad"}}, "expected Demonst"),
         ("environment", dict, {"environment": "bad"}, "expected a subclass of ImitationEnv"),
     ],
 )  # fmt: skip
@@ -191,3 +192,20 @@ def test_terms_that_a_class_does_not_observe_are_rejected(terms):
     with pytest.raises(ValueError, match=message):
         _ = Bare(config).observation_size
     assert More(config).observation_size == mimic.ImitationEnv(config).observation_size + 1
+
+
+def test_demonstrations_are_those_of_a_source(own_registry):
+    recorded = mimic.make("planar4dof", physics="fused", **SMALL).demonstrations
+
+    def slower(expert, config):
+        count = config.demonstrations.count + config.demonstrations.held_out
+        motions = recorded.select([0] * count)
+        return dataclasses.replace(motions, qpos=0.5 * motions.qpos, qvel=0.5 * motions.qvel, torque=None)
+
+    mimic.register("demonstrations", "slower", slower)
+    settings = {**SMALL, "demonstrations": {**SMALL["demonstrations"], "source": "slower"}}
+    env = mimic.make("planar4dof", physics="fused", **settings)
+    np.testing.assert_array_equal(env.demonstrations.qpos[1], 0.5 * recorded.qpos[0])
+    mimic.register("demonstrations", "slower", lambda expert, config: recorded, replace=True)
+    with pytest.raises(ValueError, match="'slower' has 2, expected at least count . held_out = 2 . 1"):
+        mimic.make("planar4dof", physics="fused", **settings)

@@ -1,9 +1,13 @@
 """Configs of runs that use what plugins register: missing plugins are one line, and nothing is imported."""
 
+import dataclasses
+
 import pytest
 
 import mimic
-from mimic.trainers.config import PPOConfig, TrainConfig
+from mimic.envs.config import EnvConfig
+from mimic.trainers.config import PPOConfig, TrainConfig, TrainerConfig, trainer_config
+from mimic.trainers.make import make_trainer
 from mimic.trainers.run_config import load_config, save_config
 
 
@@ -35,6 +39,13 @@ def test_a_missing_plugin_is_one_line(tmp_path, own_registry, kind, thing, setti
     assert "\n" not in str(error.value)
 
 
+def test_an_existing_run_needs_no_source_of_demonstrations(tmp_path, own_registry):
+    mimic.register("demonstrations", "own", lambda expert, config: None)
+    run_dir = write(tmp_path / "run", demonstrations={"source": "own"})
+    own_registry._registered["demonstrations"].clear()
+    assert load_config(run_dir).env.demonstrations.source == "own"
+
+
 def test_a_run_directory_imports_no_code(tmp_path, own_registry, monkeypatch):
     (tmp_path / "hostile.py").write_text("raise SystemExit('imported')\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -45,3 +56,27 @@ def test_a_run_directory_imports_no_code(tmp_path, own_registry, monkeypatch):
     (run_dir / "config.yaml").write_text(changed)
     with pytest.raises(ValueError, match="got 'hostile:attack'"):
         load_config(run_dir)
+
+
+@dataclasses.dataclass(frozen=True)
+class OwnConfig(TrainerConfig):
+    name: str = "own"
+    preset: str = "none"
+    rate: float = 0.5
+
+
+class OwnTrainer:
+    config_class = OwnConfig
+
+    def __init__(self, config, run_dir):
+        self.config = config
+
+
+def test_a_registered_trainer_is_made_from_its_config(own_registry, tmp_path):
+    mimic.register("trainer", "own", OwnTrainer)
+    config = TrainConfig(mimic.env_config("planar4dof"), OwnConfig(rate=0.1), run_dir=str(tmp_path / "run"))
+    assert isinstance(make_trainer(config, None), OwnTrainer)
+    assert load_config(write(tmp_path / "run", config.trainer)).trainer == OwnConfig(rate=0.1)
+    mimic.register("trainer", "own", EnvConfig, replace=True)
+    with pytest.raises(ValueError, match="trainer 'own': expected the attribute config_class"):
+        trainer_config("own")

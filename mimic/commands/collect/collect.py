@@ -15,7 +15,7 @@ from rich.table import Table
 
 from mimic.base.config import check_writable
 from mimic.base.files import write_atomically
-from mimic.commands.collect.finished_runs import QUALITY_METRICS, FinishedRun, LeftOut, QualityMetric, find_runs
+from mimic.commands.collect.finished_runs import FinishedRun, LeftOut, QualityMetric, find_runs, quality_metric
 from mimic.commands.collect.seed_groups import (
     CONFIDENCE,
     METHOD,
@@ -61,7 +61,9 @@ def prepare_collection(config: CollectConfig) -> Callable[[], int]:
             f"choose with only={trainers[0]}"
         )
     finished, repeated = drop_repeated(finished)
-    return lambda: _collect(finished, [*left_out, *repeated], out, QUALITY_METRICS[trainers[0]])
+    metric = quality_metric(trainers[0])
+    assert metric is not None  # of a finished run
+    return lambda: _collect(finished, [*left_out, *repeated], out, metric)
 
 
 def _collect(finished: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: Path, metric: QualityMetric) -> int:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from mimic.base import registry
 from mimic.base.config import flatten, to_dict
 from mimic.base.distribution import NAME, VERSION
 from mimic.base.files import read_json, read_text
@@ -40,6 +41,14 @@ QUALITY_METRICS = {
     "ppo": QualityMetric("optimality_gap", "optimality gap", "env_steps"),
     "pose_mapper": QualityMetric("quality", "distance above the optimum", "training_poses"),
 }
+
+
+def quality_metric(trainer: str) -> QualityMetric | None:
+    """The metric that runs of a trainer are compared by; a registered one has it in its attribute `quality_metric`."""
+    if trainer in QUALITY_METRICS:
+        return QUALITY_METRICS[trainer]
+    own = getattr(registry.find("trainer", trainer, "trainer.name"), "quality_metric", None)
+    return QualityMetric(*own) if own else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +156,9 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
         return LeftOut(name, f"{METRICS} cannot be read: {error}")
     if report is None:
         return LeftOut(name, _progress(path, config, history))
-    metric = QUALITY_METRICS[config.trainer.name]
+    metric = quality_metric(config.trainer.name)
+    if metric is None:
+        return LeftOut(name, f"trainer {config.trainer.name} has no quality_metric")
     numbers = _numbers(report)
     missing = [key for split in SPLITS if (key := f"{metric.key}.{split}") not in numbers]
     if missing:

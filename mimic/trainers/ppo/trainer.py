@@ -288,7 +288,7 @@ def with_saved_demonstrations(config: EnvConfig, run_dir: Path | None) -> EnvCon
     """The environment with the demonstrations of an existing run, if there is one."""
     if run_dir is None:
         return config
-    saved = dataclasses.replace(config.demonstrations, path=str(run_dir / DEMONSTRATIONS), kind=MIXED)
+    saved = dataclasses.replace(config.demonstrations, path=str(run_dir / DEMONSTRATIONS), source="", kind=MIXED)
     return dataclasses.replace(config, demonstrations=saved)
 
 
