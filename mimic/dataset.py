@@ -1,4 +1,4 @@
-"""`python -m mimic.dataset run=DIR out=DIR`: writes rollouts or demonstrations as a LeRobot dataset."""
+"""`python -m mimic.dataset run=DIR out=DIR`: writes rollouts or demonstrations as a LeRobot dataset or as rosbag2."""
 
 from mimic.base import compat
 from mimic.commands import cli

@@ -25,6 +25,7 @@ CONTROLLERS = (
 )  # fmt: skip
 ROBOT_CONTROLLERS = ("policy", "tracking")
 ARM_SIDES = ("left", "right")
+DATASET_FORMATS = ("lerobot", "rosbag2")
 
 
 def _check_locked(locked: list[Any], learner: str) -> None:
@@ -149,6 +150,7 @@ class DatasetConfig:
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
       split: "held_out" or "train": demonstrations of the run to roll the policy out on. Default "": both.
       demonstrations: file of motions to write instead of rollouts.
+      format: "lerobot" or "rosbag2".
       task: what the robot does, in words. Default "": made of the names of environment and arms.
       out: folder of the dataset; must not exist.
       compilation_cache: see `TrainConfig`.
@@ -158,12 +160,14 @@ class DatasetConfig:
     checkpoint: int | None = checkpoint_number()
     split: str = ""
     demonstrations: str = ""
+    format: str = "lerobot"
     task: str = ""
     out: str = ""
     compilation_cache: str = "~/.cache/mimic/jax"
 
     def __post_init__(self) -> None:
         check_ranges(self)
+        check_choice("format", self.format, DATASET_FORMATS)
         if self.split:
             check_choice("split", self.split, SPLITS)
 

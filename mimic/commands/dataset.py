@@ -1,4 +1,4 @@
-"""`python -m mimic.dataset`: writes rollouts or demonstrations as a LeRobot dataset."""
+"""`python -m mimic.dataset`: writes rollouts or demonstrations as a LeRobot dataset or as rosbag2."""
 
 import sys
 from collections.abc import Callable
@@ -16,23 +16,26 @@ from mimic.evaluation.labels import SPLITS
 from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.episodes import EXTRA, Episodes
 from mimic.motions.formats.lerobot import action_of, frames_per_second, write_lerobot
+from mimic.motions.formats.rosbag2 import write_rosbag2
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.files import written_atomically
 from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.run_config import policy_run
+
+_PACKAGES = {"lerobot": "pyarrow", "rosbag2": "rosbags"}  # the package that writes each format
 
 
 def prepare_dataset(config: DatasetConfig) -> Callable[[], int]:
     """Checks the config of a dataset, and restores the policy or loads the files.
 
     Raises:
-      ValueError: `out` exists, pyarrow is not installed, the run or the checkpoint does not exist, a file cannot be
-        read, or LeRobot does not have the time step.
+      ValueError: `out` exists, the package of the format is not installed, the run or the checkpoint does not exist, a
+        file cannot be read, or the format does not have the time step.
     """
     use_compilation_cache(config.compilation_cache)
     _check_keys(config)
     out = new_folder("out", config.out)
-    import_extra("pyarrow", EXTRA, "dataset")
+    import_extra(_PACKAGES[config.format], EXTRA, f"format={config.format}")
     compute = _prepare_rollouts(config) if config.run else _prepare_files(config)
 
     def run() -> int:
@@ -41,8 +44,8 @@ def prepare_dataset(config: DatasetConfig) -> Callable[[], int]:
         if not episodes.steps:
             print("error: no episode to write: each rollout of this policy is a runaway", file=sys.stderr)
             return 1
-        _write(out, episodes, console)
-        for line in [*_lines(episodes), *notes]:
+        _write(config.format, out, episodes, console)
+        for line in [*_lines(config.format, episodes), *notes]:
             console.print(line, soft_wrap=True, highlight=False, markup=False)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
         return 0
@@ -68,7 +71,7 @@ def _prepare_rollouts(config: DatasetConfig) -> Callable[[Console], _Computed]:
     """Restores the policy of a run; the returned function computes its rollouts."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
     trained.env.check_one_learner()
-    frames_per_second(trained.env.control_dt)
+    _check_time_step(config.format, trained.env.control_dt)
     trainer = make_ppo_trainer(trained, run_dir)
     steps, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
     splits = [config.split] if config.split else SPLITS
@@ -91,28 +94,39 @@ def _prepare_rollouts(config: DatasetConfig) -> Callable[[Console], _Computed]:
 def _prepare_files(config: DatasetConfig) -> Callable[[Console], _Computed]:
     """Loads motions; the returned function returns them."""
     demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
-    frames_per_second(demonstrations.dt)
+    _check_time_step(config.format, demonstrations.dt)
     provenance = _provenance("motions of a file", {"seed": demonstrations.seed})
     episodes = file_episodes(demonstrations, config.task, provenance)
     return lambda console: (episodes, [])
+
+
+def _check_time_step(format: str, dt: float) -> None:
+    if format == "lerobot":
+        frames_per_second(dt)
 
 
 def _provenance(kind: str, facts: dict[str, Any]) -> dict[str, Any]:
     return {"written_by": f"{NAME} {VERSION}", "source": kind, **facts}
 
 
-def _write(out: Path, episodes: Episodes, console: Console) -> None:
+def _write(format: str, out: Path, episodes: Episodes, console: Console) -> None:
     """Writes the dataset; its folder has its name when it is complete."""
+    write = write_lerobot if format == "lerobot" else write_rosbag2
     with written_atomically(out) as folder, console.status(f"writing {len(episodes.steps)} episodes"):
-        write_lerobot(folder, episodes)
+        write(folder, episodes)
 
 
-def _lines(episodes: Episodes) -> list[str]:
+def _lines(format: str, episodes: Episodes) -> list[str]:
     """What a dataset has."""
     robot, expert = episodes.robot, episodes.expert
     splits = ", ".join(f"{end - first} {split}" for split, (first, end) in episodes.ranges.items())
     head = f"{len(episodes.steps)} episodes ({splits}), {sum(episodes.steps)} steps of {episodes.dt:g} s"
     arms = f"robot: {robot.arm}, {len(robot.joint_names)} joints"
     arms += f"; expert: {expert.arm}, {len(expert.joint_names)} joints" if expert else ""
-    _, quantity, meaning = action_of(robot)
-    return [head, arms, f"action: {quantity.name} [{quantity.unit}], {meaning}"]
+    if format == "lerobot":
+        _, quantity, meaning = action_of(robot)
+        action = f"action: {quantity.name} [{quantity.unit}], {meaning}"
+    else:
+        known = robot.command is not None
+        action = f"commands: {robot.quantity.name} [{robot.quantity.unit}]" if known else "commands: none are known"
+    return [head, arms, action]

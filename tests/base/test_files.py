@@ -14,10 +14,9 @@ from mimic.base.npz import read_arrays
 from mimic.deploy.policy import open_session
 from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.lerobot_reading import read_lerobot
-from mimic.motions.formats.rosbag2 import read_rosbag2
+from mimic.motions.formats.rosbag2 import read_rosbag2, write_rosbag2
 from mimic.motions.importing import import_demonstrations
 from mimic.motions.mocap.reading import KINDS, read_motion
-from tests.helpers.bags import write_bags
 from tests.helpers.episodes import EXPERT, episodes
 from tests.helpers.repository import REPOSITORY
 
@@ -125,7 +124,7 @@ def test_a_pipe_in_a_lerobot_dataset_is_rejected(tmp_path, in_time, pattern):
 @pytest.mark.parametrize("pattern", ["*/metadata.yaml", "*/*.db3"])
 def test_a_pipe_in_a_rosbag2_is_rejected(tmp_path, in_time, pattern):
     pytest.importorskip("rosbags")
-    write_bags(tmp_path, episodes())
+    write_rosbag2(tmp_path, episodes())
     replaced_by_pipe(next(tmp_path.glob(pattern)))
     with pytest.raises(ValueError, match="cannot be read: .*: expected a regular file, got a named pipe"):
         read_rosbag2(tmp_path, EXPERT)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +26,8 @@ from tests.helpers.commands import run
 from tests.helpers.untrained_run import COUNT, HELD_OUT, HORIZON, environment, untrained_run
 
 pq = pytest.importorskip("pyarrow.parquet")
+pytest.importorskip("rosbags")
+from rosbags.highlevel import AnyReader  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -108,25 +111,44 @@ def test_a_split_of_a_run(run_dir, written, tmp_path):
         np.testing.assert_array_equal(held_out[name], both[name][COUNT:])
 
 
+def test_rollouts_as_bags_are_the_same(run_dir, written, tmp_path):
+    out = tmp_path / "bags"
+    text = run("dataset", f"run={run_dir}", f"out={out}", "format=rosbag2", "compilation_cache=")
+    assert f"{COUNT + HELD_OUT} episodes ({COUNT} train, {HELD_OUT} held_out)" in text
+    assert "commands: torque [N m]" in text and text.endswith(f"results: {out}\n")
+    columns = frames(written)
+    for episode in (0, COUNT):
+        with AnyReader([out / f"episode_{episode:06d}"]) as reader:
+            rows: list[tuple[str, Any]] = [
+                (c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()
+            ]
+        position = [message.position for topic, message in rows if topic == "/learner/joint_states"]
+        torque = [message.effort for topic, message in rows if topic == "/learner/joint_commands"]
+        assert len(position) == HORIZON + 1
+        np.testing.assert_allclose(position[:-1], columns["observation.state"][episode, :, :2], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(torque, columns["action"][episode], rtol=0, atol=1e-6)  # float32
+
+
 def test_demonstrations_come_back_from_a_dataset(recorded, tmp_path, monkeypatch):
     monkeypatch.setattr("mimic.commands.demonstrations.plot_demonstrations", lambda *_, **__: None)
-    dataset = write(tmp_path / "set", demonstrations=str(recorded))
+    dataset = write(tmp_path / "set", demonstrations=str(recorded), format="rosbag2")
     text = run("demonstrations", f"source={dataset}", f"out={tmp_path / 'back.npz'}")
     assert (
         "set: 3 demonstrations, 50 steps of 0.1 s\n3 motions, 15 s, 10 samples a second; velocities: from the source"
         in text
     )
     before, after = mimic.load_demonstrations(recorded), mimic.load_demonstrations(tmp_path / "back.npz")
-    np.testing.assert_allclose(after.qpos, before.qpos, rtol=0, atol=2e-7)  # single precision of up to 3 rad
-    np.testing.assert_allclose(after.qvel, before.qvel, rtol=0, atol=2e-7)
+    np.testing.assert_allclose(after.qpos, before.qpos, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(after.qvel, before.qvel, rtol=0, atol=1e-12)
 
 
-def test_a_gripper_comes_back_from_a_dataset(recorded, tmp_path):
+@pytest.mark.parametrize("format", ["lerobot", "rosbag2"])
+def test_a_gripper_comes_back_from_a_dataset(recorded, tmp_path, format):
     before = mimic.load_demonstrations(recorded)
     opening = 100 * np.random.default_rng(0).random((before.count, before.horizon + 1, 1))
     path = tmp_path / "gripper.npz"
     dataclasses.replace(before, torque=None, gripper=opening, gripper_names=("jaw",)).save(path)
-    dataset = write(tmp_path / "set", demonstrations=str(path))
+    dataset = write(tmp_path / "set", demonstrations=str(path), format=format)
     after, _ = mimic.import_demonstrations(dataset, mimic.panda())
     assert after.gripper_names == ("jaw",) and after.gripper is not None
     np.testing.assert_allclose(after.gripper, opening, atol=1e-5)  # percent in single precision
@@ -194,9 +216,9 @@ def test_nothing_is_left_where_writing_fails(recorded, tmp_path, monkeypatch):
 
 
 def test_a_missing_package_is_named(reason, recorded, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    line = reason("dataset", f"demonstrations={recorded}", "out=new")
-    assert "dataset needs the package pyarrow: pip install 'mimic-arms[datasets]'" in line
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    line = reason("dataset", f"demonstrations={recorded}", "out=new", "format=rosbag2")
+    assert "format=rosbag2 needs the package rosbags: pip install 'mimic-arms[datasets]'" in line
 
 
 @pytest.mark.parametrize(
@@ -206,6 +228,7 @@ def test_a_missing_package_is_named(reason, recorded, monkeypatch):
         (["demonstrations={npz}"], "out: expected a folder"),
         (["demonstrations={npz}", "out={npz}"], "exists; name a new folder"),
         (["demonstrations=nothing.npz", "out=new"], "no file at 'nothing.npz'"),
+        (["demonstrations={npz}", "out=new", "format=hdf5"], "format: expected one of lerobot, rosbag2, got 'hdf5'"),
         (["demonstrations={npz}", "out=new", "split=train"], "split: expected none without run="),
         (["run={run}", "out=new", "checkpoint=5"], "checkpoint"),
     ],
@@ -226,6 +249,7 @@ def test_a_time_step_that_lerobot_does_not_have(reason, recorded, tmp_path):
     path = tmp_path / "odd.npz"
     dataclasses.replace(mimic.load_demonstrations(recorded), dt=0.03).save(path)
     assert "as LeRobot counts whole frames per second" in reason("dataset", f"demonstrations={path}", "out=new")
+    write(tmp_path / "bags", demonstrations=str(path), format="rosbag2")
 
 
 def test_what_the_command_prints(recorded, tmp_path):

@@ -8,9 +8,9 @@ import numpy as np
 import mimic
 from mimic.motions.demonstrations import Demonstrations
 from mimic.motions.formats.lerobot import write_lerobot
+from mimic.motions.formats.rosbag2 import write_rosbag2
 from mimic.runs.checkpoints import save_checkpoint
 from tests.helpers import bodies, episodes, original_model
-from tests.helpers.bags import write_bags
 from tests.helpers.run_directories import write_run
 
 ARM = mimic.planar_arm([0.5, 0.3, 0.2])
@@ -32,7 +32,7 @@ def write_motions(folder: Path) -> None:
             file["demo_1"].attrs["model_file"] = f"<mujoco><worldbody>{model}</worldbody></mujoco>"
     several = np.stack([qpos, -qpos])
     Demonstrations(several, 0 * several, several[:, -1], 0.1, ARM.name, ARM.joint_names).save(folder / "recorded.npz")
-    for name, write in {"lerobot": write_lerobot, "bags": write_bags}.items():
+    for name, write in {"lerobot": write_lerobot, "bags": write_rosbag2}.items():
         if importlib.util.find_spec({"lerobot": "pyarrow", "bags": "rosbags"}[name]):
             (folder / name).mkdir()
             write(folder / name, episodes.episodes())

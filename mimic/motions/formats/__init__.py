@@ -1,1 +1,1 @@
-"""Motions in the formats of other projects, such as LeRobot datasets and rosbag2."""
+"""Motions in the formats of other projects: LeRobot datasets and rosbag2."""

@@ -36,7 +36,10 @@ def frames_per_second(dt: float) -> int:
     """
     rate = round(1 / dt)
     if rate < 1 or abs(rate * dt - 1) > 1e-6:
-        raise ValueError(f"expected a time step of 1/N s, as LeRobot counts whole frames per second, got {dt:g} s")
+        raise ValueError(
+            f"format=lerobot: expected a time step of 1/N s, as LeRobot counts whole frames per second, got {dt:g} s; "
+            "format=rosbag2 takes any"
+        )
     return rate
 
 

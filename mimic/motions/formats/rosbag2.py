@@ -1,9 +1,9 @@
-"""Reads joint motions from rosbag2, the recordings of ROS 2: https://github.com/ros2/rosbag2.
+"""Reads and writes joint motions as rosbag2, the recordings of ROS 2: https://github.com/ros2/rosbag2.
 
-Messages are sensor_msgs/JointState, in rad and rad/s. A bag is one motion; a dataset is a folder of bags.
+Messages are sensor_msgs/JointState, in rad, rad/s and N m. A bag is one motion; a dataset is a folder of bags.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +11,117 @@ import numpy as np
 
 from mimic.base.distribution import import_extra
 from mimic.base.files import check_file, check_folder
-from mimic.motions.formats.episodes import EXTRA, MAX_NUMBERS, Motion, Recording
+from mimic.motions.formats.episodes import (
+    ANGLE,
+    EXTRA,
+    MAX_NUMBERS,
+    TORQUE,
+    VELOCITY,
+    ArmMotions,
+    Episodes,
+    Motion,
+    Recording,
+)
 from mimic.motions.formats.names import Selection, select
 
-METADATA = "metadata.yaml"
+METADATA, BAG = "metadata.yaml", "episode_{:06d}"
 BAG_FILES = (".db3", ".mcap")  # a bag that is one file
+START = 10**9  # ns, the time of the first sample: a stamp of 0 means none in ROS
 _TYPE = "sensor_msgs/msg/JointState"
+_STATES, _COMMANDS = "joint_states", "joint_commands"
+_VERSION = 8  # of the format: that of ROS 2 Iron and Jazzy
+_FIELD = {ANGLE: "position", VELOCITY: "velocity", TORQUE: "effort"}  # of a message, for each kind of command
 _MAX_BAGS = 100_000
 _FLOATS_OF_JOINT = 3  # in a message
 _DISTINCT = 0.3  # least fraction of stamps that differ, of those of a clock: some messages are published twice
 _RESET = 5 * 10**8  # ns, a step back of a clock that starts anew; messages of several publishers arrive late by less
+
+
+def write_rosbag2(folder: Path, episodes: Episodes) -> None:
+    """Writes a bag for each episode into an empty folder. Needs rosbags.
+
+    Topics: /joint_states and /joint_commands, with the prefixes /learner and /expert where both arms are known. Bags
+    begin at 1 s.
+
+    Args:
+      folder: the folder.
+      episodes: the motions.
+    """
+    from rosbags.rosbag2 import Writer
+
+    for index in range(len(episodes.steps)):
+        with Writer(folder / BAG.format(index), version=_VERSION) as writer:
+            for key, value in _custom_data(episodes, index).items():
+                writer.set_custom_data(key, value)
+            _write_episode(writer, episodes, index)
+
+
+def _write_episode(writer: Any, episodes: Episodes, index: int) -> None:
+    """Writes the messages of an episode in the order of their times."""
+    store = _type_store()
+    message_types = {name: store.types[name] for name in (_TYPE, "std_msgs/msg/Header", "builtin_interfaces/msg/Time")}
+    joint_state, header, time = message_types.values()
+    topics = {
+        topic: (names, fields, writer.add_connection(topic, _TYPE, typestore=store))
+        for topic, names, fields in _topics(episodes, index)
+    }
+    none = np.zeros(0)
+    for sample in range(episodes.steps[index] + 1):
+        stamp = START + round(sample * episodes.dt * 1e9)
+        for names, fields, connection in topics.values():
+            values = {field: array[sample] for field, array in fields.items() if sample < len(array)}
+            if not values:
+                continue  # no command after the last step
+            message = joint_state(
+                header(time(stamp // 10**9, stamp % 10**9), frame_id=""),
+                name=names,
+                **{field: values.get(field, none) for field in _FIELD.values()},
+            )
+            writer.write(connection, stamp, store.serialize_cdr(message, _TYPE))
+
+
+def _topics(episodes: Episodes, index: int) -> Iterator[tuple[str, list[str], dict[str, np.ndarray]]]:
+    """Topics of an episode with the names of their joints and the values of each field [samples, joints]."""
+    arms = {"": episodes.robot}
+    if episodes.expert is not None:
+        arms = {"/expert": episodes.expert, "/learner": episodes.robot}
+    steps = episodes.steps[index]
+    for prefix, motions in arms.items():
+        states = {field: _floats(array[: steps + 1]) for field, array in _states(motions, index).items()}
+        yield f"{prefix}/{_STATES}", [*motions.joint_names, *motions.gripper_names], states
+        if motions.command is not None:
+            commands = {_FIELD[motions.quantity]: _floats(motions.command[index][:steps])}
+            yield f"{prefix}/{_COMMANDS}", list(motions.joint_names), commands
+
+
+def _states(motions: ArmMotions, index: int) -> dict[str, np.ndarray]:
+    """Positions and velocities of the joints and then the gripper, whose velocities are not known."""
+    if motions.gripper is None:
+        return {"position": motions.qpos[index], "velocity": motions.qvel[index]}
+    gripper = motions.gripper[index]
+    return {
+        "position": np.concatenate([motions.qpos[index], gripper], axis=1),
+        "velocity": np.concatenate([motions.qvel[index], np.full_like(gripper, np.nan)], axis=1),
+    }
+
+
+def _floats(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, np.float64)
+
+
+def _custom_data(episodes: Episodes, index: int) -> dict[str, str]:
+    """The custom data of a bag: what it is from, and what its messages mean."""
+    facts = {
+        **episodes.provenance,
+        "task": episodes.task,
+        "split": episodes.splits[index],
+        "demonstration": episodes.numbers[index],
+        "robot": episodes.robot.arm,
+        "expert": "" if episodes.expert is None else episodes.expert.arm,
+        "time_step_s": episodes.dt,
+        "units": "position rad, velocity rad/s, effort N m",
+    }
+    return {key: str(value) for key, value in facts.items()}
 
 
 def _type_store() -> Any:

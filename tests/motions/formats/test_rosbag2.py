@@ -1,26 +1,86 @@
-"""Bags that the library of others writes are read, and damaged ones are rejected."""
+"""rosbag2: the library of others reads typed messages of what is written, and bags of others are read."""
 
 import sqlite3
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
 
-from mimic.motions.formats.rosbag2 import is_rosbag2, read_rosbag2
-from tests.helpers.bags import SECOND, TYPE, write_bags
-from tests.helpers.episodes import DT, EXPERT, LEARNER, episodes, motions
+from mimic.motions.formats.rosbag2 import is_rosbag2, read_rosbag2, write_rosbag2
+from tests.helpers.episodes import COUNT, DT, EXPERT, LEARNER, STEPS, episodes, motions
 
 rosbags = pytest.importorskip("rosbags")
+from rosbags.highlevel import AnyReader  # noqa: E402
 from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: E402
 from rosbags.typesys import Stores, get_typestore  # noqa: E402
 
+TYPE = "sensor_msgs/msg/JointState"
+SECOND = 10**9  # ns
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 @pytest.fixture
 def written(tmp_path):
-    write_bags(tmp_path / "bags", episodes())
+    write_rosbag2(tmp_path / "bags", episodes())
     return tmp_path / "bags"
+
+
+def messages(bag) -> list[tuple[str, int, Any]]:
+    """Topic, time [ns] and message of each, with the types that the bag itself defines."""
+    with AnyReader([bag], default_typestore=STORE) as reader:
+        return [(c.topic, time, reader.deserialize(raw, c.msgtype)) for c, time, raw in reader.messages()]
+
+
+def of_topic(rows, topic):
+    return [message for name, _, message in rows if name == topic]
+
+
+def test_each_episode_is_a_bag_of_typed_messages(written):
+    source = episodes()
+    assert sorted(path.name for path in written.iterdir()) == [f"episode_{index:06d}" for index in range(COUNT)]
+    for episode, steps in enumerate(source.steps):
+        rows = messages(written / f"episode_{episode:06d}")
+        assert {message.__msgtype__ for _, _, message in rows} == {TYPE}
+        assert {topic for topic, _, _ in rows} == {
+            *("/expert/joint_states", "/expert/joint_commands"),
+            *("/learner/joint_states", "/learner/joint_commands"),
+        }  # fmt: skip
+        for topic, arm in (("/expert/joint_states", source.expert), ("/learner/joint_states", source.robot)):
+            states = of_topic(rows, topic)
+            assert {tuple(message.name) for message in states} == {arm.joint_names}
+            np.testing.assert_array_equal([m.position for m in states], arm.qpos[episode, : steps + 1])
+            np.testing.assert_array_equal([m.velocity for m in states], arm.qvel[episode, : steps + 1])
+            assert all(len(message.effort) == 0 for message in states)
+            commands = of_topic(rows, topic.replace("states", "commands"))
+            np.testing.assert_array_equal([m.effort for m in commands], arm.command[episode, :steps])
+            assert all(len(message.position) == len(message.velocity) == 0 for message in commands)
+
+
+def test_stamps_are_the_times_of_the_samples(written):
+    """From 1 s, since ROS takes a stamp of 0 as none."""
+    rows = messages(written / "episode_000000")
+    stamps = [message.header.stamp.sec * SECOND + message.header.stamp.nanosec for _, _, message in rows]
+    assert stamps == [time for _, time, _ in rows] == sorted(stamps)
+    states = [stamp for stamp, row in zip(stamps, rows, strict=True) if row[0] == "/learner/joint_states"]
+    assert states == [SECOND + round(DT * sample * SECOND) for sample in range(STEPS + 1)]
+
+
+def test_the_metadata_tell_what_a_bag_is(written):
+    from ruamel.yaml import YAML
+
+    content = YAML(typ="safe").load((written / "episode_000002/metadata.yaml").read_text())
+    information = content["rosbag2_bagfile_information"]
+    assert information["message_count"] == 4 * STEPS + 2 and information["storage_identifier"] == "sqlite3"
+    assert information["duration"]["nanoseconds"] == round(STEPS * DT * SECOND)
+    custom = information["custom_data"]
+    assert custom["units"] == "position rad, velocity rad/s, effort N m"
+    assert (custom["task"], custom["split"], custom["demonstration"]) == ("imitate", "held_out", "0")
+
+
+def test_one_arm_has_the_topics_that_ros_expects(tmp_path):
+    write_rosbag2(tmp_path / "bags", episodes(robot=motions(LEARNER, 0, commands=False), expert=False))
+    assert {topic for topic, _, _ in messages(tmp_path / "bags/episode_000000")} == {"/joint_states"}
 
 
 @pytest.mark.parametrize(("joints", "topic"), [(EXPERT, ""), (LEARNER, "/learner/joint_states")])
@@ -87,7 +147,6 @@ def test_bags_of_drivers_and_simulations(tmp_path, settings, notes):
     np.testing.assert_allclose(motion.time, SAMPLES, atol=1e-6)  # of 1.7e9 s in double precision
     np.testing.assert_allclose(motion.qpos[:, 0], 0.5 * np.sin(2 * SAMPLES))
     if settings.get("velocity", True):
-        assert motion.qvel is not None
         np.testing.assert_allclose(motion.qvel[:, 0], np.cos(2 * SAMPLES))
     else:
         assert motion.qvel is None
@@ -113,7 +172,7 @@ def test_bags_without_the_joints(tmp_path):
 
 
 def test_several_topics_with_the_joints_are_a_question(tmp_path):
-    write_bags(tmp_path / "bags", episodes(robot=motions(EXPERT, 0)))
+    write_rosbag2(tmp_path / "bags", episodes(robot=motions(EXPERT, 0)))
     with pytest.raises(ValueError, match="topic=/expert/joint_states or topic=/learner/joint_states"):
         read_rosbag2(tmp_path / "bags", EXPERT)
     with pytest.raises(ValueError, match=r"topic: expected a topic .*; got '/learner/joint_commands'"):
