@@ -309,7 +309,7 @@ class InspectConfig:
         check_choice("limits", self.limits, LIMITS)
         _ = base_numbers(self.base)
         if self.clip:
-            check_unused(self, ("out", "base"), "with clip=, which has no arm of a robot")
+            check_unused(self, ("out", "base"), "with clip=, whose arms `mimic.view source=` shows")
         else:
             check_unused(self, ("capture",), "without clip=FILE")
         if self.base != "same" and not self.bound:
@@ -391,14 +391,14 @@ class ViewConfig:
     Attributes:
       env: environment that defines the arms and the metric.
       run: run directory of a policy to play. Its arms and demonstrations are used.
-      source: tcp://localhost:PORT, a socket of this machine that takes points of a person, who is the expert, or poses
-        of a hand as lines of JSON.
+      source: motion capture file of a person to play as the expert, or tcp://localhost:PORT, a socket of this machine
+        that takes points as lines of JSON.
       demonstrations: file of the expert's demonstrations to choose from. Default "": random ones are recorded.
       hand: how the learner's hand follows the expert's at the start: "free", "exact" or "relative", see `HandSettings`.
       base: where the learner's base then stands, see `base_numbers`.
       record: new folder for what the hand drives, a LeRobot data set, written at the end. Default "": none.
       arm: "left" or "right" arm of the person in `source`. Default "": right.
-      capture: how these points are read.
+      capture: how `source` is read.
       checkpoint: steps of the checkpoint of the policy. Default None: the last checkpoint.
       split: "held_out" or "train": demonstrations of the run to show first.
       host: address of the server; 0.0.0.0 is every address of this machine.

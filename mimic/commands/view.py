@@ -18,9 +18,12 @@ from mimic.commands.arm_keys import check_no_arms
 from mimic.commands.config import ViewConfig, base_numbers
 from mimic.commands.view_capture import (
     CapturedExpert,
+    clip_expert,
     hand_expert,
+    is_address,
     listen,
     live_expert,
+    read_clip,
     wait_for_arm,
 )
 from mimic.commands.view_server import check_port, serve
@@ -132,25 +135,33 @@ def _finish(config: ViewConfig, session: LiveSession) -> None:
 
 
 def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
-    """Listens for the captured person of `source`; the returned function shows it."""
+    """Checks the captured person of `source`; the returned function shows it."""
 
     def show(expert: CapturedExpert) -> int:
         live = _session(config, expert.env)
         return _serve_session(config, expert.env, live, lambda: expert.controls(live), CAPTURE_RATE, _NUMBERS_RATE)
 
-    listener = listen(config)
+    if is_address(config.source):
+        listener = listen(config)
 
-    def run() -> int:
-        with contextlib.closing(listener):
-            measured = wait_for_arm(listener, config, env)
-            if measured is None:
-                return 0
-            if isinstance(measured, LiveHand):
-                return show(hand_expert(env, listener))
-            with live_expert(env, *measured, listener) as expert:
-                return show(expert)
+        def run_live() -> int:
+            with contextlib.closing(listener):
+                measured = wait_for_arm(listener, config, env)
+                if measured is None:
+                    return 0
+                if isinstance(measured, LiveHand):
+                    return show(hand_expert(env, listener))
+                with live_expert(env, *measured, listener) as expert:
+                    return show(expert)
 
-    return run
+        return run_live
+    content = read_clip(config, env)
+
+    def run_clip() -> int:
+        with clip_expert(env, *content) as expert:
+            return show(expert)
+
+    return run_clip
 
 
 def _prepare_playback(config: ViewConfig) -> Callable[[], int]:

@@ -1,4 +1,4 @@
-"""The captured person of a view, whose points arrive at a local socket."""
+"""The captured person of a view: a clip that is played, or points that arrive at a local socket."""
 
 import contextlib
 import dataclasses
@@ -13,18 +13,19 @@ import numpy as np
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.base.config import check_unused
-from mimic.commands.capture import fixed_fraction, named_arm, trunk_length
+from mimic.commands.capture import fixed_fraction, named_arm, read_arm, trunk_length
 from mimic.commands.config import CaptureConfig, ViewConfig
 from mimic.envs.config import EnvConfig
 from mimic.motions.mocap.arms import find_arms, find_facing
 from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
+from mimic.motions.mocap.clips import slow_down_for
 from mimic.motions.mocap.conventions import UNITS
 from mimic.motions.mocap.link_motion import LinkMotion
 from mimic.motions.mocap.live_hand import LiveHand
 from mimic.motions.mocap.live_points import LiveArm, Sample, live_body
 from mimic.motions.mocap.point_socket import PointListener
 from mimic.runs.signals import Signals, noted_signals
-from mimic.viewer.captured import HandTracker, PointTracker, Said
+from mimic.viewer.captured import Clip, ClipPlayer, HandTracker, PointTracker, Said, make_clip
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.origins import is_local
 
@@ -32,7 +33,8 @@ SCHEME = "tcp://"
 _SAMPLES = 25  # complete ones, from which the lengths of a live arm are measured
 _INCOMPLETE = 50  # samples without all points of the arm, after which a line says so
 _POLL = 0.005  # s
-_OF_CLIPS = ("cutoff", "speed", "slow_down", "overlap", "held_out")  # keys of `capture` without a meaning here
+_OF_CLIPS = ("cutoff", "speed", "slow_down")  # keys of `capture` without a meaning for live points
+_OF_WINDOWS = ("overlap", "held_out")  # and without one for any view
 
 
 class CapturedExpert(NamedTuple):
@@ -47,21 +49,64 @@ class CapturedExpert(NamedTuple):
     controls: Callable[[LiveSession], Any]
 
 
+def is_address(source: str) -> bool:
+    """Whether a source is the address of a socket, not a file."""
+    return source.startswith(SCHEME)
+
+
+def read_clip(config: ViewConfig, env: EnvConfig) -> tuple[Clip, LinkMotion, np.ndarray]:
+    """The clip in the file `source`, the links of its longest part, and their zero frames.
+
+    Raises:
+      ValueError: what `read_arm` rejects, or keys that a view does not use.
+    """
+    capture = config.capture
+    check_unused(capture, _OF_WINDOWS, "with this source of a view, which cuts no windows", "capture.")
+    fixed = fixed_fraction(env.build_arm("learner").embodiment)
+    read = read_arm(Path(config.source).expanduser(), config.arm or "right", capture, fixed)
+    kept = [index for index, part in enumerate(read.parts) if len(part.start) > 2]
+    if not kept:
+        raise ValueError(f"source: expected a motion of at least 3 samples, {config.source!r} has none without gaps")
+    parts, starts = [read.parts[index] for index in kept], [read.starts[index] for index in kept]
+    longest = max(parts, key=lambda part: len(part.start))
+    zero = zero_frames(longest)
+    slow_down = capture.slow_down or slow_down_for(parts, capture.speed, cutoff=capture.cutoff)
+    clip = make_clip(parts, starts, zero, slow_down=slow_down, cutoff=capture.cutoff)
+    print(
+        f"{Path(config.source).name}, {longest.name}: {clip.duration:.1f} s, {slow_down:.2f} times as long as captured "
+        f"(capture.slow_down=1 for as captured); gaps bridged: {read.bridged}; parts: {len(parts)}"
+    )
+    return clip, longest, zero
+
+
+@contextlib.contextmanager
+def clip_expert(env: EnvConfig, clip: Clip, links: LinkMotion, zero: np.ndarray) -> Iterator[CapturedExpert]:
+    """Context in which the expert of a clip has a model file."""
+    from mimic.viewer.capture_controls import ClipControls
+
+    with _with_model(env, links, zero) as with_expert:
+        yield CapturedExpert(with_expert, lambda session: ClipControls(session, ClipPlayer(clip)))
+
+
 def listen(config: ViewConfig) -> PointListener:
     """A listener at the address `source`.
 
     Raises:
       ValueError: no address, one that other machines can reach though `host` is not that one, or one that is in use.
     """
-    reason = "in a view, whose points are neither filtered nor slowed down"
-    check_unused(config.capture, _OF_CLIPS, reason, "capture.")
-    expected = f"source: expected {SCHEME}localhost:PORT, got {config.source!r:.100}"
+    check_unused(
+        config.capture,
+        (*_OF_CLIPS, *_OF_WINDOWS),
+        "with this source of a view, whose points are neither filtered nor slowed down",
+        "capture.",
+    )
+    expected = f"source: expected a file or {SCHEME}localhost:PORT, got {config.source!r:.100}"
     try:
         parts = urlsplit(config.source)
         host, port = parts.hostname, parts.port
     except ValueError as error:
         raise ValueError(f"{expected}: {error}") from None
-    if parts.scheme != "tcp" or not host or not port or parts.path or parts.query or parts.username:
+    if not host or not port or parts.path or parts.query or parts.username:
         raise ValueError(expected)
     if not is_local(host) and host != config.host:
         raise ValueError(

@@ -1,17 +1,94 @@
-"""Points of a person that arrive, and move the expert of a view. Needs no browser."""
+"""Captured motions that move the expert of a view: a clip that is played, or points that arrive. Need no browser."""
 
+import bisect
+import dataclasses
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
+from mimic.motions.mocap.ball_chain import ball_chain_motion
+from mimic.motions.mocap.link_motion import LinkMotion
 from mimic.motions.mocap.live_points import LiveArm
 from mimic.motions.mocap.point_socket import PointListener
+from mimic.viewer.timeline import Timeline
 
 SILENCE = 1.0  # s without a sample, after which the sender counts as stopped
 PAUSE = 1.0  # s; after a longer one, the next pose may be anywhere
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Clip:
+    """Poses of a captured arm over time; between its parts, which gaps separate, it holds the last pose.
+
+    Attributes:
+      starts: time of each part [s], as it is played.
+      poses: [samples, joints] of each part [rad].
+      interval: time between samples [s], as it is played.
+    """
+
+    starts: Sequence[float]
+    poses: Sequence[Float[np.ndarray, "samples joints"]]
+    interval: float
+
+    @property
+    def duration(self) -> float:
+        """Time of the last sample [s]."""
+        return self.starts[-1] + (len(self.poses[-1]) - 1) * self.interval
+
+    def part(self, time: float) -> int:
+        """The part at a time [s], or the last one before it."""
+        return max(bisect.bisect_right(self.starts, time) - 1, 0)
+
+    def pose(self, time: float) -> Float[np.ndarray, " joints"]:
+        """Pose at a time [s], linear between samples [rad]."""
+        part = self.part(time)
+        poses = self.poses[part]
+        sample = float(np.clip((time - self.starts[part]) / self.interval, 0, len(poses) - 1))
+        before = min(int(sample), len(poses) - 2)
+        return poses[before] + (sample - before) * (poses[before + 1] - poses[before])
+
+
+def make_clip(
+    parts: Sequence[LinkMotion],
+    starts: Sequence[float],
+    zero: Float[np.ndarray, "links 3 3"],
+    *,
+    slow_down: float = 1.0,
+    cutoff: float,
+) -> Clip:
+    """The clip of a captured arm.
+
+    Args:
+      parts: motions of the arm, in the order of time.
+      starts: time of each part in the capture [s].
+      zero: see `ball_chain_xml`.
+      slow_down: factor on times.
+      cutoff: see `motion_states`.
+    """
+    poses = [ball_chain_motion(part, zero, cutoff=cutoff)[0] for part in parts]
+    return Clip([slow_down * (start - starts[0]) for start in starts], poses, slow_down / parts[0].rate)
+
+
+class ClipPlayer:
+    """Plays a clip.
+
+    Attributes:
+      clip: the clip.
+      timeline: its time.
+    """
+
+    def __init__(self, clip: Clip):
+        self.clip, self.timeline = clip, Timeline(clip.duration)
+
+    def advance(self, dt: float) -> tuple[np.ndarray | None, bool]:
+        """Advances by a time step [s]; returns the pose, None where it has not changed, and whether it jumped."""
+        before = self.clip.part(self.timeline.time)
+        changed, jumped = self.timeline.advance(dt)
+        time = self.timeline.time
+        return (self.clip.pose(time), jumped or self.clip.part(time) != before) if changed else (None, False)
 
 
 class Said:

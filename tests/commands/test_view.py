@@ -22,7 +22,7 @@ from mimic.envs import env_config
 from mimic.motions.mocap.live_hand import LiveHand
 from mimic.motions.mocap.live_points import Sample, sample_line
 from mimic.runs.signals import Signals
-from tests.helpers.bodies import person
+from tests.helpers.bodies import bvh_text, person
 
 
 @pytest.mark.parametrize(
@@ -32,16 +32,16 @@ from tests.helpers.bodies import person
         (["learner=missing.xml"], "no MJCF or URDF file at"),
         (["run=a", "learner=panda"], "learner: expected none with run=, which brings its own"),
         (["run=a", "env=panda3dof"], "env: expected none with run=, which brings its own"),
-        (["source=tcp://localhost:9000", "expert=panda"], "expert: expected none with source=, which brings its own"),
+        (["source=a.bvh", "expert=panda"], "expert: expected none with source=, which brings its own"),
         (["hand=near"], "hand: expected one of free, exact, relative, got 'near'"),
         (["base=[0,0,0,1]"], "base: expected same or [x,y,z,yaw] with hand=exact or relative"),
         (["demonstrations=a.npz", "run=b"], "demonstrations: expected none with run="),
         (["demonstrations=missing.npz"], "missing.npz"),
         (["capture.yaw=3"], "capture: expected none without source="),
-        (["source=tcp://localhost:9000", "arm=middle"], "arm: expected one of left, right, got 'middle'"),
-        (["source=a.bvh"], "source: expected tcp://localhost:PORT, got 'a.bvh'"),
-        (["source=tcp://localhost"], "source: expected tcp://localhost:PORT"),
-        (["source=tcp://localhost:9000", "capture.slow_down=2"], "capture.slow_down: expected none in a view"),
+        (["source=a.bvh", "arm=middle"], "arm: expected one of left, right, got 'middle'"),
+        (["source=a.bvh", "capture.overlap=0.1"], "capture.overlap: expected none with this source of a view"),
+        (["source=tcp://localhost"], "source: expected a file or tcp://localhost:PORT"),
+        (["source=tcp://localhost:9000", "capture.slow_down=2"], "capture.slow_down: expected none with this source"),
         (["source=tcp://0.0.0.0:9000"], "to take points from other machines, set host=0.0.0.0 too"),
     ],
 )
@@ -178,18 +178,21 @@ def test_an_address_of_other_machines_needs_the_host_too():
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-arms[view]'")
-def test_live_points_move_the_learner(sends):
-    """The whole command: points arrive and stop."""
+def test_a_clip_and_live_points_move_the_learner(tmp_path, sends):
+    """The whole command: the clip is played, then points arrive and stop."""
+    (tmp_path / "clip.bvh").write_text(bvh_text(120))
     port = free_port()
-    arguments = [f"source=tcp://localhost:{port}", "learner=panda", f"port={free_port()}"]
-    command = [sys.executable, "-m", "mimic.view", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert "waiting for points at tcp://localhost" in process.stdout.readline()
-    sends(port)
-    assert "view: http://127.0.0.1:" in process.stdout.readline()
-    time.sleep(1)
-    process.send_signal(signal.SIGINT)
-    out, error = process.communicate(timeout=200)
-    assert process.returncode == 0 and "Traceback" not in error and "view: ended" in out
-    assert "samples" in out
+    for source in (str(tmp_path / "clip.bvh"), f"tcp://localhost:{port}"):
+        command = [sys.executable, "-m", "mimic.view", f"source={source}", "learner=panda", f"port={free_port()}"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        assert "right_arm: " in first or "waiting for points at tcp://localhost" in first
+        if "waiting" in first:
+            sends(port)
+        assert "view: http://127.0.0.1:" in process.stdout.readline()
+        time.sleep(1)
+        process.send_signal(signal.SIGINT)
+        out, error = process.communicate(timeout=200)
+        assert process.returncode == 0 and "Traceback" not in error and "view: ended" in out
+        assert ("samples" in out) == ("waiting" in first)

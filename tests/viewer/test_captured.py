@@ -1,17 +1,70 @@
-"""Points and poses of a hand that move a live view."""
+"""Captured motions that move a live view: the player of a clip, and the tracker of points."""
 
 import dataclasses
 from typing import Any
 
 import numpy as np
+import pytest
 
 from mimic.motions.mocap.arms import find_arms
 from mimic.motions.mocap.ball_chain import zero_frames
+from mimic.motions.mocap.link_motion import arm_motion
 from mimic.motions.mocap.live_hand import LiveHand
 from mimic.motions.mocap.live_points import LiveArm, Sample, live_body
 from mimic.motions.mocap.point_socket import Counts
-from mimic.viewer.captured import HandTracker, PointTracker, Said
+from mimic.viewer.captured import Clip, ClipPlayer, HandTracker, PointTracker, Said, make_clip
 from tests.helpers.bodies import RATE, person
+
+
+@pytest.fixture
+def clip():
+    """Two parts of 3 and 2 samples, 0.125 s apart, from 0 s and from 1 s; binary fractions, to be exact."""
+    return Clip([0.0, 1.0], [np.array([[0.0], [1.0], [2.0]]), np.array([[5.0], [6.0]])], 0.125)
+
+
+@pytest.mark.parametrize(
+    ("time", "angle"),
+    [(0.0, 0.0), (0.0625, 0.5), (0.25, 2.0), (0.7, 2.0), (1.0, 5.0), (1.0625, 5.5), (9.0, 6.0), (-1, 0)],
+)
+def test_poses_of_a_clip(clip, time, angle):
+    assert clip.pose(time)[0] == pytest.approx(angle)
+    assert clip.duration == pytest.approx(1.125)
+
+
+def test_a_clip_is_slowed_down():
+    body = person(60)
+    motion = arm_motion(body)
+    zero = zero_frames(motion)
+    clip = make_clip([motion.cut(0, 20), motion.cut(30, 60)], [2.0, 2.5], zero, slow_down=3.0, cutoff=np.inf)
+    assert clip.starts == [0.0, 1.5] and clip.interval == pytest.approx(3 / RATE)
+    np.testing.assert_allclose(clip.pose(1.5 + 3 * 4 / RATE), clip.poses[1][4], atol=1e-9)
+
+
+def test_a_player_plays_and_says_where_it_jumps(clip):
+    player = ClipPlayer(clip)
+    poses, jumps = zip(*[player.advance(0.125) for _ in range(12)], strict=True)
+    assert [pose is not None for pose in poses] == [True] * 12
+    assert [i for i, jumped in enumerate(jumps) if jumped] == [0, 7, 9]  # its start, the second part, its repetition
+    assert poses[9][0] == 0.0 and poses[10][0] == 1.0
+
+
+def test_a_paused_player_computes_nothing(clip):
+    player = ClipPlayer(clip)
+    player.advance(0.1)
+    player.timeline.is_playing = False
+    assert player.advance(0.1) == (None, False)
+    player.timeline.go_to(1.0625)
+    pose, jumped = player.advance(0.1)
+    assert pose is not None and pose[0] == pytest.approx(5.5) and jumped
+    player.timeline.go_to(float("nan"))
+    assert player.advance(0.1) == (None, False)
+
+
+def test_a_player_that_does_not_repeat_ends_at_the_last_pose(clip):
+    player = ClipPlayer(clip)
+    player.timeline.repeats = False
+    last = [pose for pose, _ in (player.advance(0.3) for _ in range(10)) if pose is not None][-1]
+    assert last[0] == pytest.approx(6.0) and not player.timeline.is_playing
 
 
 class Listener:
