@@ -500,9 +500,13 @@ def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple
         loaded.check_fits(expert.embodiment, config.control_dt, config.horizon)
         check_effort(loaded, expert.embodiment, RECORDED_SPEED if loaded.torque is None else 1.0)
         if loaded.count < settings.count + settings.held_out:
+            held_out = math.ceil(loaded.count / 10)
+            key = "env.demonstrations"
             raise ValueError(
                 f"demonstrations: {label!r} has {loaded.count}, expected at least "
                 f"count + held_out = {settings.count} + {settings.held_out}"
+                + f"; as with {key}.count={loaded.count - held_out} {key}.held_out={held_out}"
+                * (loaded.count > 1)
             )
     else:
         loaded = recorded_demonstrations(config, expert, settings.count + settings.held_out)

@@ -150,7 +150,7 @@ def test_angles_torques_and_velocities_beyond_the_limits_are_rejected_and_roundi
     [
         (lambda recorded: dataclasses.replace(recorded, arm="other"), "got those of 'other'"),
         (lambda recorded: changed(recorded, "qvel", 3.0), "has a velocity of"),
-        (lambda recorded: recorded.select([0]), r"has 1, expected at least count \+ held_out = 1 \+ 1"),
+        (lambda recorded: recorded.select([0]), r"has 1, expected at least count \+ held_out = 1 \+ 1$"),
     ],
     ids=["another arm", "too fast", "too few"],
 )
@@ -160,6 +160,17 @@ def test_training_rejects_demonstrations_that_do_not_fit(recorded, tmp_path, cha
     config = mimic.env_config("panda4dof", demonstrations={"path": str(path), "count": 1, "held_out": 1})
     with pytest.raises(ValueError, match=message):
         training_and_held_out(config)
+
+
+def test_too_few_demonstrations_can_be_trained_on_by_the_settings_that_are_named(recorded, tmp_path):
+    recorded.save(tmp_path / "demonstrations.npz")
+    settings = {"path": str(tmp_path / "demonstrations.npz")}
+    message = r"as with env.demonstrations.count=1 env.demonstrations.held_out=1$"
+    with pytest.raises(ValueError, match=message):
+        training_and_held_out(mimic.env_config("panda7dof", demonstrations=settings))
+    settings |= {"count": 1, "held_out": 1}
+    training, held_out = training_and_held_out(mimic.env_config("panda7dof", demonstrations=settings))
+    assert training.count == held_out.count == 1
 
 
 def test_a_gripper_is_kept_with_the_motions(recorded, tmp_path):
