@@ -40,7 +40,6 @@ _ATTEMPTS, _FEW = 4, 0.2  # for each episode; fraction of its frames that fail
 _THREADS = 8  # at most; each certifies an episode
 _AT_ONCE = {"cpu": 2**12, "gpu": 2**16}  # frames of a group of episodes; a longer episode is a group of its own
 _SHOWN = 12  # episodes in the table; those that fail come first
-_POSITION_ALONE = 0.5  # of the frames that fail: with so many whose hand is at its place, the rotation is what fails
 
 
 class _Setting(NamedTuple):
@@ -328,14 +327,11 @@ def _help_line(certificates: Mapping[str, Certificate], setting: _Setting) -> st
     if not failing:
         return ""
     causes = " ".join(cause for item in failing for cause in item.causes)
-    wrong = [item.position[np.array([bool(cause) for cause in item.causes])] for item in failing]
     advice = []
     if "velocity limit" in causes:
         advice.append("a slower source (velocity limits)")
     if "out of reach" in causes or "range" in causes:
         advice.append("another base (base=auto)" if setting.base is None else "another base (base=[x,y,z,yaw])")
-    if np.mean(np.concatenate(wrong) < 1e-3) > _POSITION_ALONE:
-        advice.append("the hand's position alone")
     if "touch" in causes:
         advice.append("a cost of touching (costs.self_collision=0.1)")
     if "hand" in causes:

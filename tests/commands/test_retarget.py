@@ -114,3 +114,11 @@ def test_an_episode_of_which_few_frames_fail_is_searched_again(monkeypatch, fail
     seed, certificate = found["hard"]
     assert seed == chosen
     assert sum(map(bool, certificate.causes)) == failing[chosen]
+
+
+def test_advice_is_what_a_user_can_set():
+    none = np.zeros(3)  # all hands are at their places: their rotations are wrong
+    certificate = Certificate(none, none + 1, none, none, none, ("hand out of reach",) * 3)
+    setting = retarget._Setting(*[None] * 6, 0, *[None] * 5)  # type: ignore[arg-type]
+    line = retarget._help_line({"episode": certificate}, setting)
+    assert line == "what would help: another base (base=auto); hand=near, which takes the nearest hand"
