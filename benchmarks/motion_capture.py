@@ -11,6 +11,7 @@ does it. Besides the measures of similarity: the largest speed of a joint betwee
 """
 
 import dataclasses
+import itertools
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -128,11 +129,11 @@ METHODS: dict[str, Callable[[Case], np.ndarray | None]] = {
 }
 
 
-def measure(case: Case, methods: list[str]) -> list[Row]:
+def measure(case: Case) -> list[Row]:
     """Measures of each method that applies."""
     line, rows = centre_line_table(case.expert, case.qpos), []
-    for method in methods:
-        motion = METHODS[method](case)
+    for method, imitate in METHODS.items():
+        motion = imitate(case)
         if motion is not None:
             rows.append({"method": method, **_measures(line, case.learner, np.asarray(motion, float), case.rate)})
     return rows
@@ -156,23 +157,15 @@ def _measures(line: object, learner: mimic.Embodiment, qpos: np.ndarray, rate: f
 def main() -> None:
     parser = make_parser("motion_capture", __doc__, rate=20.0)
     parser.add_argument("clips", nargs="+", type=Path)
-    parser.add_argument("--learners", nargs="+", metavar="NAME", help="some of the robots")
-    parser.add_argument("--methods", nargs="+", metavar="NAME", choices=METHODS, default=list(METHODS))
     parser.add_argument("--arms", type=Path, help="folder with an unpacked wheel of robosuite")
     options = parser.parse_args()
     rows: list[Row] = []
-    robots = learners(options.arms)
-    unknown = [name for name in options.learners or () if name not in robots]
-    if unknown:
-        parser.error(f"learners: expected some of {', '.join(robots)}, got {unknown[0]!r}")
-    for clip in options.clips:
-        for name in options.learners or robots:
-            for side in SIDES:
-                case = read_case(clip, side, name, robots[name], options.rate)
-                names = {"clip": clip.name, "arm": side, "learner": name}
-                rows += [{**names, **row} for row in measure(case, options.methods)]
-                print(f"{clip.name}, {side} arm to {name}", flush=True)
-                write_results(options, rate=options.rate, results=rows)
+    for clip, (name, robot), side in itertools.product(options.clips, learners(options.arms).items(), SIDES):
+        case = read_case(clip, side, name, robot, options.rate)
+        names = {"clip": clip.name, "arm": side, "learner": name}
+        rows += [{**names, **row} for row in measure(case)]
+        print(f"{clip.name}, {side} arm to {name}", flush=True)
+        write_results(options, rate=options.rate, results=rows)
     print_table(
         rows,
         "clip arm learner method centre_line_distance:.4f tangent_angle_deg:.1f hand_position_error:.4f "

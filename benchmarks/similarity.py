@@ -1,6 +1,6 @@
 """Similarity of the learner to the expert at the optimum of each candidate metric, by measures that nothing optimises.
 
-    python -m benchmarks.similarity --out FILE [--arms FOLDER] [--plot FILE.png] [--pair NAME ...] [--hands]
+    python -m benchmarks.similarity --out FILE [--arms FOLDER] [--plot FILE.png] [--hands]
 
 The learner takes the pose of minimum distance under each candidate metric (links kept or merged, correspondence,
 translation weight; the rotation weight is 1); with --hands under the default metric with each weight of the hand's
@@ -147,19 +147,15 @@ def run_pair(pair: EnvConfig, demonstrations: int, *, hands: bool = False) -> li
 
 def main() -> None:
     parser = make_parser("similarity", __doc__, plot=Path, demonstrations=20, arms="robosuite")
-    parser.add_argument("--pair", nargs="+", metavar="NAME", help="these pairs alone")
     parser.add_argument("--hands", action="store_true", help="weights of the hand's rotation in the default metric")
     options = parser.parse_args()
     logging.getLogger("mimic").setLevel(logging.ERROR)
     others, missing = other_arms(Path(options.arms))
-    pairs = {pair.name: pair for pair in (*locked_pandas(), *others)}
-    if unknown := set(options.pair or ()) - set(pairs):
-        parser.error(f"unknown pair {min(unknown)!r}; valid are {', '.join(pairs)}")
     settings = {"demonstrations": options.demonstrations, "every": EVERY}
     rows: list[Row] = []
-    for name in options.pair or pairs:
-        rows += run_pair(pairs[name], options.demonstrations, hands=options.hands)
-        print(name, flush=True)
+    for pair in (*locked_pandas(), *others):
+        rows += run_pair(pair, options.demonstrations, hands=options.hands)
+        print(pair.name, flush=True)
         failed = [row for row in rows if "failed" in row]
         summary = similarity_front.summarise(rows)
         write_results(options, settings=settings, not_found=missing, summary=summary, failed=failed)

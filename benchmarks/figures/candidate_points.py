@@ -3,17 +3,14 @@
 import dataclasses
 from typing import Any
 
-import matplotlib
+import numpy as np
+from jaxtyping import Float
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from jaxtyping import Float  # noqa: E402
-
-from benchmarks.figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, joint_points  # noqa: E402
-from mimic.arms.embodiment import Embodiment, planar_arm  # noqa: E402
-from mimic.metric.distance import DistanceWeights, embodiment_distance  # noqa: E402
-from mimic.metric.kinematics import candidate_points, link_states  # noqa: E402
+from benchmarks.figures.canvas import plt
+from benchmarks.figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, joint_points
+from mimic.arms.embodiment import Embodiment, planar_arm
+from mimic.metric.distance import DistanceWeights, embodiment_distance
+from mimic.metric.kinematics import candidate_points, link_states
 
 _POSITIONS = DistanceWeights(translation=1.0, rotation=0.0)
 _DIRECTIONS = DistanceWeights(translation=0.0, rotation=1.0)

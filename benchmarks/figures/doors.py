@@ -6,14 +6,11 @@ python -m benchmarks.figures.doors WORK --out docs/images
 import json
 from pathlib import Path
 
-import matplotlib
+import numpy as np
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-
-from benchmarks.common.parser import make_parser  # noqa: E402
-from benchmarks.transfer import ARMS  # noqa: E402
+from benchmarks.common.parser import make_parser
+from benchmarks.figures.canvas import plt
+from benchmarks.transfer import ARMS
 
 _DT, _OPEN = 0.05, 0.3  # s; rad, from which robosuite counts the door as open
 _FROM = 9.0  # s: the hand arrives at the handle

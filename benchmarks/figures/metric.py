@@ -4,23 +4,20 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import matplotlib
+import matplotlib.patches
+import numpy as np
 
-matplotlib.use("Agg")
-import matplotlib.patches  # noqa: E402
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-
-from benchmarks.figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
-from mimic.arms.embodiment import Embodiment, planar_arm  # noqa: E402
-from mimic.metric.correspondence import (  # noqa: E402
+from benchmarks.figures.canvas import plt
+from benchmarks.figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm
+from mimic.arms.embodiment import Embodiment, planar_arm
+from mimic.metric.correspondence import (
     arc_length_correspondence,
     hard_correspondence,
     overlap_correspondence,
     soft_correspondence,
 )
-from mimic.metric.distance import DistanceWeights, link_distances  # noqa: E402
-from mimic.metric.kinematics import link_states  # noqa: E402
+from mimic.metric.distance import DistanceWeights, link_distances
+from mimic.metric.kinematics import link_states
 
 _EXPERT, _LEARNER = planar_arm([0.4, 0.35, 0.25]), planar_arm([0.55, 0.45])
 _EXPERT_POSE, _LEARNER_POSE = np.array([1.9, -1.1, -1.0]), np.array([1.2, -1.0])

@@ -7,27 +7,24 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import matplotlib.ticker  # noqa: E402
-import numpy as np  # noqa: E402
-from matplotlib.lines import Line2D  # noqa: E402
+import matplotlib.ticker
+import numpy as np
+from matplotlib.lines import Line2D
 
 from benchmarks.figures import candidate_points, similarity
-from benchmarks.figures import metric as metric_figures  # noqa: E402
-from benchmarks.figures.planar_arms import add_match_legend, draw_match, fit, joint_points  # noqa: E402
-from mimic.arms.embodiment import planar_arm  # noqa: E402
-from mimic.arms.link_match import LinkMatch  # noqa: E402
-from mimic.arms.rendering import ArmScene  # noqa: E402
-from mimic.envs import env_config  # noqa: E402
-from mimic.metric.config import MetricConfig  # noqa: E402
-from mimic.metric.correspondence import hard_correspondence, overlap_correspondence  # noqa: E402
-from mimic.metric.distance import DistanceWeights, Metric, adaptive_weights  # noqa: E402
-from mimic.metric.kinematics import link_states  # noqa: E402
-from mimic.retargeting.pose import imitate_pose  # noqa: E402
-from mimic.trainers.pose_mapper.mapper import PoseMapper  # noqa: E402
+from benchmarks.figures import metric as metric_figures
+from benchmarks.figures.canvas import plt
+from benchmarks.figures.planar_arms import add_match_legend, draw_match, fit, joint_points
+from mimic.arms.embodiment import planar_arm
+from mimic.arms.link_match import LinkMatch
+from mimic.arms.rendering import ArmScene
+from mimic.envs import env_config
+from mimic.metric.config import MetricConfig
+from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
+from mimic.metric.distance import DistanceWeights, Metric, adaptive_weights
+from mimic.metric.kinematics import link_states
+from mimic.retargeting.pose import imitate_pose
+from mimic.trainers.pose_mapper.mapper import PoseMapper
 
 LoadMapper = Callable[[str], PoseMapper]  # from the name of an environment
 

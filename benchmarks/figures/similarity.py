@@ -2,16 +2,13 @@
 
 from typing import Any
 
-import matplotlib
+import matplotlib.patches
+import numpy as np
 
-matplotlib.use("Agg")
-import matplotlib.patches  # noqa: E402
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-
-from benchmarks.figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
-from mimic.arms.embodiment import planar_arm  # noqa: E402
-from mimic.metric.similarity import MEASURES, CentreLine, centre_line_table, similarity  # noqa: E402
+from benchmarks.figures.canvas import plt
+from benchmarks.figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm
+from mimic.arms.embodiment import planar_arm
+from mimic.metric.similarity import MEASURES, CentreLine, centre_line_table, similarity
 
 _EXPERT, _LEARNER = planar_arm([0.4, 0.35, 0.25]), planar_arm([0.55, 0.45])
 _EXPERT_POSE, _LEARNER_POSE = np.array([1.9, -1.1, -1.0]), np.array([0.6, 0.9])
