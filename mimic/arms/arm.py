@@ -168,8 +168,10 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
       links: see `MetricConfig`.
 
     Raises:
-      ValueError: what `panda`, `planar_arm` and `load_mjcf` reject.
+      ValueError: no config, or what `panda`, `planar_arm` and `load_mjcf` reject.
     """
+    if not isinstance(config, ArmConfig):
+        raise ValueError(f"config: expected an ArmConfig, as of ArmConfig(model='panda'), got {config!r:.80}")
     is_planar = config.model == "planar"
     path = config.model if config.is_file else panda_path(config.model)
     embodiment, source, angles = load_arm(

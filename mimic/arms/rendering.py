@@ -41,7 +41,7 @@ class ArmScene:
       colours: colours of each arm's links by name, as of `LinkMatch`. Default None: those of the models.
 
     Raises:
-      ValueError: an arm cannot be built, or no OpenGL library works.
+      ValueError: an arm cannot be built, an image without pixels, or no OpenGL library works.
     """
 
     def __init__(
@@ -54,6 +54,8 @@ class ArmScene:
         fast: bool = False,
         colours: Sequence[Mapping[str, Colour]] | None = None,
     ):
+        if min(width, height) < 1:
+            raise ValueError(f"width, height: expected at least 1 pixel, got {width}, {height}")
         built_arms = [build_arm(arm, limits) for arm in arms]
         unlocked = [build_arm(dataclasses.replace(arm, locked=()), limits).embodiment for arm in arms]
         reach = max(float(arm.chain_length) for arm in unlocked)  # the scale does not depend on locked joints

@@ -77,3 +77,10 @@ def test_rotor_inertia_and_damping_by_joint():
 def test_bad_rotor_inertia(values, message):
     with pytest.raises(ValueError, match=message):
         build_arm(ArmConfig(armature=values))
+
+
+def test_a_name_is_no_config():
+    with pytest.raises(
+        ValueError, match=r"config: expected an ArmConfig, as of ArmConfig\(model='panda'\), got 'panda'"
+    ):
+        build_arm("panda")  # type: ignore[arg-type]

@@ -105,3 +105,8 @@ def test_an_overlay_is_drawn_at_the_last_arm():
     with ArmScene([PLANAR, PLANAR], width=160, height=120) as scene:
         image = scene.image([np.zeros(2), np.zeros(2)], [capsule])
     assert red_share(image[:, 80:]) > 0.002 and red_share(image[:, :80]) == 0
+
+
+def test_an_image_has_pixels():
+    with pytest.raises(ValueError, match="width, height: expected at least 1 pixel, got -1, 480"):
+        ArmScene([ArmConfig()], width=-1)
