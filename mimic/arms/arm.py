@@ -48,7 +48,7 @@ class ArmConfig:
       locked: joint names or numbers, or a mapping from these to angles [rad].
       link_lengths: lengths of the links of a planar arm [m].
       base: for a file, name of the body that carries the chain.
-      tip: for a file, name of the body or site at the end of the chain; default: see `find_chain`. A list of names
+      tip: for a file, name of the body or site at the end of the chain. Default: see `find_chain`. A list of names
         gives a tree with a chain to each of them, and ["*"] one to each end of the model.
       hand: for a file, the hand's frame: the name of a site or body of the last link, whose z-axis is the approach and
         whose x-axis the direction in which the gripper opens, or a pose [x, y, z, qw, qx, qy, qz] in the last link [m];

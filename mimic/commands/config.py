@@ -118,7 +118,7 @@ class RenderConfig:
       expert: its expert: name or file of an arm, or an environment that has it.
       learner: its learner, in the same way; of a run of many arms, name or file of the arm.
       locked: numbers or names of the joints of this arm that are locked; of a run of many arms.
-      limits: the `limits` that `retargeted` was computed with, see `EnvConfig`.
+      limits: the `limits` that `retargeted` was computed with.
       out: video file. Default "": a file in the folder `videos` of the run directory.
       compilation_cache: see `TrainConfig`.
     """
@@ -289,7 +289,8 @@ class InspectConfig:
       expert: arm that it should imitate.
       limits: see `EnvConfig`.
       bound: whether to compute the kinematic bound of the distance and what the hand keeps, which takes a minute.
-      base: where the learner's base stands, see `RetargetConfig`; "auto" for where most of the expert's range is exact.
+      base: "same" for the learner's base where the expert's is, "auto" for where most of the expert's range is exact,
+        or [x,y,z,yaw] in the expert's base frame [m, rad].
       out: new folder for a picture of both arms with their correspondence and their reach, and a JSON file of all
         results.
       clip: motion capture file to inspect instead of an arm.
@@ -346,7 +347,7 @@ class RetargetConfig:
       base: "same" for the learner's base where the expert's is, "auto" for where most frames are exact,
         or [x,y,z,yaw] in the expert's base frame [m, rad].
       failing: what becomes of episodes that fail, "left_out" or "kept".
-      joints, topic, units, rate: of `source`, see `RecordingConfig`.
+      joints, topic, units, rate: see `RecordingConfig`.
       env: environment that defines the arms and the metric.
       limits: see `EnvConfig`. Default None: those of the models.
       out: folder of the learner's data set; must not exist.

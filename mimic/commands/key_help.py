@@ -12,13 +12,18 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
+from mimic.commands.config import RecordingConfig, RetargetConfig
 from mimic.envs.config import DemonstrationConfig, EnvConfig
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.presets import MAPPER_PRESETS, PPO_PRESETS
 
 _WIDTH, _COLUMN = 120, 38  # characters of a line, and in front of the explanation
 _PRESETS: dict[type, dict[str, dict[str, Any]]] = {PPOConfig: PPO_PRESETS, PoseMapperConfig: MAPPER_PRESETS}
-_REFERRED = {config.__name__: config for config in (TrainConfig, EnvConfig, DemonstrationConfig)}
+_REFERRED = {
+    config.__name__: config for config in (TrainConfig, EnvConfig, DemonstrationConfig, RecordingConfig, RetargetConfig)
+}
+# References to the library, which say nothing on a command line.
+_OF_LIBRARY = re.compile(r"(?:[,;] see| \(see) [\w.]+(?: for formats| in \S+)?\)?(?=$|[;,])")
 _ATTRIBUTE = re.compile(r"^  (\w+(?:, \w+)*): (.*(?:\n    .*)*)", re.MULTILINE)  # of a docstring's section
 
 
@@ -43,7 +48,7 @@ def explanations(config_class: type) -> dict[str, str]:
         section = (inspect.getdoc(base) or "").partition("Attributes:\n")[2]
         for names, text in _ATTRIBUTE.findall(section):
             sentence = re.split(r"\.(?:\s|$)", " ".join(text.split()))[0].replace("`", "")
-            texts |= {name: _followed(name, sentence) for name in names.split(", ")}
+            texts |= {name: _OF_LIBRARY.sub("", _followed(name, sentence)) for name in names.split(", ")}
     return texts
 
 

@@ -30,6 +30,7 @@ def test_every_key_has_an_explanation(name, schemas):
     config_class = typing.get_type_hints(importlib.import_module(f"mimic.{name}").prepare)["config"]
     for line in key_lines(DictConfig(schemas(config_class))):
         assert line.endswith(":") or re.search(r": .*  # \w|: +# \w|  # \S", line), line
+        assert not re.search(r"[,;:(] ?see [\w.]", line) and not re.search(r"# .*see \w+Config", line), line
 
 
 @pytest.mark.parametrize("config_class", BUILT_IN_TRAINERS.values())
