@@ -26,6 +26,7 @@ from .metric.correspondence import overlap_correspondence as overlap_corresponde
 from .metric.correspondence import soft_correspondence as soft_correspondence
 from .metric.distance import PAPER_WEIGHTS as PAPER_WEIGHTS
 from .metric.distance import DistanceWeights as DistanceWeights
+from .metric.distance import LinkDistance as LinkDistance
 from .metric.distance import PairDistances as PairDistances
 from .metric.distance import adaptive_weights as adaptive_weights
 from .metric.distance import embodiment_distance as embodiment_distance

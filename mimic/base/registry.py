@@ -18,6 +18,7 @@ KINDS = {
     "correspondence": "a function (expert, learner) -> W, or -> a function of the link distances that returns W",
     "demonstrations": "a function (expert, config) -> Demonstrations",
     "environment": "a mapping with fields of EnvConfig, or a subclass of ImitationEnv",
+    "link_distance": "a function (expert link, learner link) -> distance",
     "observation_term": "a function (env, state) -> vector",
     "reward_term": "a function (env, transition) -> number",
     "trainer": "a subclass of Trainer with the attribute config_class",
@@ -42,7 +43,8 @@ def register(kind: str, name: str, thing: Any = None, *, replace: bool = False) 
     Without a thing, it returns a decorator: `@mimic.register("reward_term", "lift")`.
 
     Args:
-      kind: "environment", "reward_term", "observation_term", "correspondence", "demonstrations" or "trainer".
+      kind: "environment", "reward_term", "observation_term", "correspondence", "link_distance", "demonstrations" or
+        "trainer".
       name: letters, digits, "_" and "-".
       thing: a function or class, or for an environment a mapping; see `mimic.base.registry.KINDS`.
       replace: whether to replace what is registered under this name, as when a notebook's cell runs again.

@@ -28,7 +28,7 @@ from mimic.envs.config import OBSERVATION_TERMS, EnvConfig
 from mimic.envs.start_poses import start_poses
 from mimic.envs.terms import ObservationTerm, Transition, observation_terms, observed, reward_terms
 from mimic.metric.capsule_distances import changing_pairs
-from mimic.metric.distance import Metric
+from mimic.metric.distance import LinkDistance, Metric
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 from mimic.motions.demonstrations import RECORDED_SPEED, Demonstrations, check_effort, load_demonstrations
 from mimic.motions.experts import KINDS, MIXED
@@ -310,6 +310,9 @@ class ImitationEnv(Env):
         """Distance charged per step of a runaway: all corresponding links antiparallel, at opposite ends, at rest."""
         metric, n, n_hat = self.config.metric, self.expert.num_links, self.learner.num_links
         per_pair = np.pi * metric.rotation + 2 * metric.translation + 4 * metric.adaptive
+        if isinstance(self.metric.weights, LinkDistance):
+            with jax.ensure_compile_time_eval():
+                per_pair = float(self.metric.weights.function(*_opposite_links()))
         # The Frobenius norm is at most the sum of the entries; those of hard and soft W sum to n + n_hat.
         total = n + n_hat if callable(self.metric.correspondence) else np.asarray(self.metric.correspondence).sum()
         of_links = per_pair * total / (n * n_hat if metric.reduction == "mean" else 1)
@@ -401,6 +404,13 @@ def where_done(done: Float[Array, " batch"], new: Any, old: Any) -> Any:
         return jnp.where(is_done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
 
     return jax.tree.map(choose, new, old)
+
+
+def _opposite_links() -> tuple[LinkStates, LinkStates]:
+    """Two links that are antiparallel, at opposite ends of the reach and at rest."""
+    x, zero = jnp.array([[1.0, 0.0, 0.0]]), jnp.zeros((1, 3))
+    links = LinkStates(x, x, zero, zero), LinkStates(-x, -x, zero, zero)
+    return jax.tree.map(lambda leaf: leaf[0], links)
 
 
 def env_class(config: EnvConfig) -> type[ImitationEnv]:

@@ -26,6 +26,7 @@ from mimic.metric.distance import (
     ROTATION_MEASURES,
     Correspondence,
     DistanceWeights,
+    LinkDistance,
     Metric,
     PairDistances,
     Reduction,
@@ -53,6 +54,7 @@ class MetricConfig:
       rotation_measure: "cosine" or "angle".
       links: "kept" (a locked joint removes no link) or "merged" (its two links become one chord; paper).
       correspondence: "arc_length" or "overlap" (static), "hard" or "soft" (by distance), or a registered name.
+      link_distance: a registered function of two links, in place of the weighted parts; none where empty.
       reduction: "mean" or "frobenius".
     """
 
@@ -67,16 +69,21 @@ class MetricConfig:
     correspondence: str = "arc_length"
     reduction: str = "mean"
     links: str = "kept"
+    link_distance: str = ""
 
     def __post_init__(self) -> None:
         check_choice("links", self.links, LINKS)
         registry.check("correspondence", self.correspondence, "correspondence")
+        if self.link_distance:
+            registry.check("link_distance", self.link_distance, "link_distance")
         check_choice("rotation_measure", self.rotation_measure, ROTATION_MEASURES)
         check_choice("reduction", self.reduction, REDUCTIONS)
         check_ranges(self, "metric.")
 
     def make_weights(self) -> Weights:
-        """The weights: constants, or a function of the distances."""
+        """The weights: constants, a function of the distances, or an own distance between links."""
+        if self.link_distance:
+            return LinkDistance(registry.find("link_distance", self.link_distance, "metric.link_distance"))
         velocities = {"linear_velocity": self.linear_velocity, "angular_velocity": self.angular_velocity}
         if self.adaptive:
             return partial(_adaptive_weights, **velocities)
@@ -149,7 +156,7 @@ def check_metric(config: MetricConfig) -> DistanceWeights:
     if different or not isinstance(weights, DistanceWeights):
         raise ValueError(
             "metric: expected the default one, with any constant weights, for arms as arrays, got "
-            + (", ".join(different) or f"adaptive={config.adaptive}")
+            + (", ".join(different) or f"adaptive={config.adaptive}, link_distance={config.link_distance!r}")
         )
     return weights
 

@@ -53,7 +53,19 @@ class PairDistances:
     angular_velocity: Float[Array, "*pairs"]
 
 
-Weights = DistanceWeights | Callable[[PairDistances], DistanceWeights]
+@dataclasses.dataclass(frozen=True)
+class LinkDistance:
+    """An own distance between two links, in place of weights: it replaces the weighted sum of the parts.
+
+    Attributes:
+      function: (state of an expert link, state of a learner link) -> distance, at least 0; `LinkStates` of one link,
+        [3] each. It must be differentiable, also where the links match.
+    """
+
+    function: Callable[[LinkStates, LinkStates], Float[Array, ""]]
+
+
+Weights = DistanceWeights | Callable[[PairDistances], DistanceWeights] | LinkDistance
 Correspondence = (
     Real[ArrayLike, "expert learner"] | Callable[[Float[Array, "expert learner"]], Float[Array, "expert learner"]]
 )
@@ -96,7 +108,8 @@ def link_distances(
       expert_states: link states of the expert; normalized, to compare arms of different size. Batch axes before those
         of a sample broadcast with those of the learner.
       learner_states: link states of the learner.
-      weights: constants, or a function of the unweighted distances of one pair, such as `adaptive_weights`.
+      weights: constants, or a function of the unweighted distances of one pair, such as `adaptive_weights`; or a
+        `LinkDistance`.
       rotation: the rotational measure, see `rotation_distance`.
 
     Raises:
@@ -114,6 +127,9 @@ def _link_distances(
     expert_states, learner_states = (
         dataclasses.replace(states, hand=None) for states in (expert_states, learner_states)
     )
+    if isinstance(weights, LinkDistance):
+        own = jax.vmap(jax.vmap(weights.function, in_axes=(None, 0)), in_axes=(0, None))
+        return own(expert_states, learner_states)
     if not callable(weights):
         _check_candidate_points(expert_states, learner_states, weights)
     over_learner = jax.vmap(lambda a, b: pair_distances(a, b, rotation), in_axes=(None, 0))
@@ -309,8 +325,8 @@ def check_matrix(name: str, matrix: np.ndarray) -> None:
 def _check_weights(weights: Any) -> None:
     if isinstance(weights, DistanceWeights):  # not when they are made: their gradients have the same type
         check_ranges(weights, "weights.")
-    elif not callable(weights):
-        raise ValueError(f"weights: expected DistanceWeights or a function, got {weights!r:.80}")
+    elif not callable(weights) and not isinstance(weights, LinkDistance):
+        raise ValueError(f"weights: expected DistanceWeights, a function or a LinkDistance, got {weights!r:.80}")
 
 
 def _check_candidate_points(a: LinkStates, b: LinkStates, weights: DistanceWeights) -> None:

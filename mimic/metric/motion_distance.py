@@ -108,7 +108,7 @@ def gradient_by_learner(
     """Gradient of the distance to states of the expert, by the learner's angles [1/rad], then its speeds [s/rad].
 
     In closed form where `motion_distance` has one, else by automatic differentiation; 0 where that is not finite, as of
-    a registered correspondence with the root of a distance of 0.
+    the norm of two positions that match.
 
     Args:
       metric: between the two arms.

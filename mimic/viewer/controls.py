@@ -79,7 +79,7 @@ class LiveControls:
             initial = getattr(settings, term)
             weight = gui.add_slider(
                 term, 0.0, max(_MAX_WEIGHT, initial), _WEIGHT_STEP, initial,
-                disabled=self._env.metric.adaptive,
+                disabled=self._env.metric.adaptive or bool(self._env.metric.link_distance),
                 hint="weight of this term of the distance",
             )  # fmt: skip
             weight.on_update(by_user(lambda value, term=term: session.change(**{term: float(value)})))

@@ -161,7 +161,7 @@ def _metric_of_weights(
     base_metric = dataclasses.replace(env.metric, correspondence=settings.correspondence).build(expert, learner)
 
     def metric(weights: Array) -> Metric:
-        if env.metric.adaptive:
+        if env.metric.adaptive or env.metric.link_distance:
             return base_metric
         # A constant weight of 0 removes its term, which makes the optimiser's derivatives much simpler.
         constant = DistanceWeights(0.0 if settings.translation == 0 else weights[0], weights[1])

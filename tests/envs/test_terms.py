@@ -113,6 +113,13 @@ def test_ending_an_episode_early_is_never_better(own_registry, monkeypatch):
     np.testing.assert_allclose(state.reward, -5 * (env._worst_distance + 0.8), rtol=1e-6)
 
 
+def test_a_runaway_is_charged_the_own_distance(own_registry):
+    mimic.register("link_distance", "squared", lambda a, b: ((a.position - b.position) ** 2).sum())
+    env = mimic.make("planar4dof", physics="fused", metric={"link_distance": "squared"}, **SMALL)
+    matrix = np.asarray(env.metric.correspondence)
+    assert env._worst_distance == pytest.approx(4 * matrix.mean() + 0.02 * np.pi)  # opposite ends and hands
+
+
 @pytest.mark.parametrize(
     ("kind", "thing", "settings", "message"),
     [

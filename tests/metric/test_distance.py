@@ -211,7 +211,7 @@ def test_candidate_points_reject_weights_on_what_they_lack(part, field):
         (DistanceWeights(translation=-1.0), "weights.translation: expected a number from 0 to 1e.06, got -1.0"),
         (DistanceWeights(rotation=np.array([[1.0], [np.nan], [0.0]])), "weights.rotation: expected a number from 0"),
         (DistanceWeights(linear_velocity=np.inf), "weights.linear_velocity: .* got inf"),
-        ((0.0, 1.0), "weights: expected DistanceWeights or a function, got"),
+        ((0.0, 1.0), "weights: expected DistanceWeights, a function or a LinkDistance, got"),
         (HandWeights(position=-1.0), "hand_weights.position: expected a number from 0 to 1e.06, got -1.0"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Correspondences of registered functions."""
+"""Correspondences and distances of registered functions."""
 
 import jax
 import jax.numpy as jnp
@@ -7,6 +7,7 @@ import pytest
 
 import mimic
 from mimic.metric.config import MetricConfig
+from mimic.metric.distance import LinkDistance
 from mimic.metric.motion_distance import gradient_by_learner
 
 EXPERT, LEARNER = mimic.planar_arm([0.5, 0.3, 0.2]), mimic.planar_arm([0.6, 0.4])
@@ -54,9 +55,9 @@ def test_a_bad_matrix_is_one_line(own_registry, matrix, message):
     assert "\n" not in str(error.value)
 
 
-def test_a_gradient_is_0_where_that_of_the_correspondence_is_not_finite(own_registry):
-    mimic.register("correspondence", "root", lambda expert, learner: jnp.sqrt)
-    metric = MetricConfig(correspondence="root", hand_rotation=0.0).build(EXPERT, EXPERT)
+def test_the_gradient_of_a_link_distance_is_0_where_it_is_not_finite(own_registry):
+    mimic.register("link_distance", "norm", lambda expert, learner: jnp.linalg.norm(expert.position - learner.position))
+    metric = MetricConfig(link_distance="norm").build(EXPERT, EXPERT)
 
     def gradient(angle):
         states = mimic.link_states(EXPERT, jnp.full(3, angle))
@@ -64,4 +65,19 @@ def test_a_gradient_is_0_where_that_of_the_correspondence_is_not_finite(own_regi
 
     same, moved = map(jax.jit(gradient), (0.0, 0.1))
     np.testing.assert_array_equal(same, 0)
-    assert np.all(np.abs(moved[:3]) > 1e-3)
+    assert np.all(np.abs(moved[:3]) > 0.01)
+
+
+def test_a_registered_link_distance_replaces_the_weighted_parts(own_registry):
+    def squared(expert_link, learner_link):
+        return ((expert_link.position - learner_link.position) ** 2).sum()
+
+    mimic.register("link_distance", "squared", squared)
+    metric = MetricConfig(link_distance="squared").build(EXPERT, LEARNER)
+    assert metric.weights == LinkDistance(squared) and not metric.is_static
+    expert, learner = states()
+    difference = np.asarray(expert.position)[:, None] - np.asarray(learner.position)
+    np.testing.assert_allclose(metric.link_distances(expert, learner), (difference**2).sum(axis=-1), rtol=1e-5)
+    # all that takes weights takes it: the pose that is nearest by positions alone
+    solution = mimic.imitate_pose(LEARNER, LEARNER, np.array([0.5, -0.7]), np.eye(2), metric.weights)
+    assert solution.distance < 1e-6  # the same arm
