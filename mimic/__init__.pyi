@@ -38,10 +38,13 @@ from .metric.hand import HandWeights as HandWeights
 from .metric.hand import hand_distance as hand_distance
 from .metric.kinematics import Frames as Frames
 from .metric.kinematics import LinkStates as LinkStates
+from .metric.kinematics import body_twists as body_twists
 from .metric.kinematics import candidate_points as candidate_points
 from .metric.kinematics import forward_kinematics as forward_kinematics
 from .metric.kinematics import hand_frames as hand_frames
 from .metric.kinematics import link_states as link_states
+from .metric.landscape import distance_landscape as distance_landscape
+from .metric.landscape import local_minima as local_minima
 from .metric.motion_distance import motion_distance as motion_distance
 from .motions.demonstrations import Demonstrations as Demonstrations
 from .motions.demonstrations import check_effort as check_effort

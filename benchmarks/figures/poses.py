@@ -21,8 +21,8 @@ from mimic.arms.rendering import ArmScene
 from mimic.envs import env_config
 from mimic.metric.config import MetricConfig
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
-from mimic.metric.distance import DistanceWeights, Metric, adaptive_weights
-from mimic.metric.kinematics import link_states
+from mimic.metric.distance import DistanceWeights, adaptive_weights
+from mimic.metric.landscape import distance_landscape, local_minima
 from mimic.retargeting.pose import imitate_pose
 from mimic.trainers.pose_mapper.mapper import PoseMapper
 
@@ -30,7 +30,6 @@ LoadMapper = Callable[[str], PoseMapper]  # from the name of an environment
 
 _TWO_LINKS = planar_arm([0.5, 0.5])
 _CONTOUR_POSE = np.array([1.5, -1.5])  # of the expert in Fig. 2 d-f of the paper
-ANGLES = np.linspace(-np.pi, np.pi, 180, endpoint=False)  # rad, of each joint in Fig. 2 d-f
 _WEIGHTS_POSE = np.array([2.3, -2.0])
 _OTHER_TWO_LINKS = planar_arm([0.25, 0.75])  # identical arms would match for any weights
 # Joint positions of the Panda [rad] that show the whole arm and are within its joint ranges.
@@ -61,21 +60,6 @@ def draw_weights(load_mapper: LoadMapper) -> Any:
     return figure
 
 
-def distances_of_all_poses(metric: Metric) -> np.ndarray:
-    """Distance of each pose of a two-link arm to `_CONTOUR_POSE` of an equal one; rows are the first joint's angle."""
-    states = link_states(_TWO_LINKS, _CONTOUR_POSE)
-    over_grid = jax.vmap(
-        jax.vmap(lambda *qpos: metric(states, link_states(_TWO_LINKS, jnp.stack(qpos))), (None, 0)), (0, None)
-    )
-    return np.asarray(jax.jit(over_grid)(ANGLES, ANGLES))
-
-
-def local_minima(distance: np.ndarray) -> np.ndarray:
-    """Indices [minima, 2] of the poses with a smaller distance than all eight neighbours; the grid is periodic."""
-    shifts = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
-    return np.argwhere(np.all([distance < np.roll(distance, shift, axis=(0, 1)) for shift in shifts], axis=0))
-
-
 def draw_contours(load_mapper: LoadMapper) -> Any:
     """Draws the distance over all poses of an identical two-link arm, with every local minimum.
 
@@ -91,13 +75,13 @@ def draw_contours(load_mapper: LoadMapper) -> Any:
     )
     figure, all_axes = plt.subplots(1, 4, figsize=(13, 3.6), sharey=True, layout="constrained")
     for letter, axes, (name, correspondence, weights) in zip("defg", all_axes, metrics, strict=True):
-        distance = distances_of_all_poses(Metric(correspondence, weights))
-        filled = axes.contourf(ANGLES, ANGLES, distance.T, levels=24, cmap="viridis")
-        axes.contour(ANGLES, ANGLES, distance.T, levels=24, colors="black", linewidths=0.2)
+        angles, distance = distance_landscape(_TWO_LINKS, _TWO_LINKS, _CONTOUR_POSE, correspondence, weights)
+        filled = axes.contourf(angles, angles, distance.T, levels=24, cmap="viridis")
+        axes.contour(angles, angles, distance.T, levels=24, colors="black", linewidths=0.2)
         minima = local_minima(distance)
         best = minima[np.argmin([distance[i, j] for i, j in minima])]
-        axes.plot(ANGLES[minima[:, 0]], ANGLES[minima[:, 1]], "o", color="white", mec="black", ms=6)
-        axes.plot(ANGLES[best[0]], ANGLES[best[1]], "*", color="red", mec="white", ms=13)
+        axes.plot(angles[minima[:, 0]], angles[minima[:, 1]], "o", color="white", mec="black", ms=6)
+        axes.plot(angles[best[0]], angles[best[1]], "*", color="red", mec="white", ms=13)
         count = f"{len(minima)} local minima" if len(minima) > 1 else "1 local minimum"
         axes.set_title(f"({letter})  {name}:\n{count}", fontsize="small")
         axes.set(xlabel=r"$\hat q_1$ [rad]", aspect="equal")

@@ -346,6 +346,27 @@ def candidate_points(states: LinkStates) -> LinkStates:
     return dataclasses.replace(states, direction=None, angular_velocity=None, hand=None)
 
 
+def body_twists(
+    arm: Embodiment, qpos: Float[ArrayLike, "*#batch joints"], qvel: Float[ArrayLike, "*#batch joints"]
+) -> Float[Array, "*batch links 6"]:
+    """Body twists [omega, v] of the link frames, V = T^-1 dT/dt (paper, eq. 7).
+
+    Units: omega [rad/s] and v [m/s], both in the link's own frame.
+
+    Args:
+      arm: the embodiment.
+      qpos: joint angles [rad].
+      qvel: joint velocities [rad/s].
+
+    Raises:
+      ValueError: `qpos` or `qvel` is not [..., joints].
+    """
+    rotations, states = forward_kinematics(arm, qpos).rotation, link_states(arm, qpos, qvel, normalized=False)
+    assert states.angular_velocity is not None
+    twists = [jnp.sum(rotations * x[..., None], axis=-2) for x in (states.angular_velocity, states.linear_velocity)]
+    return jnp.concatenate(twists, axis=-1)
+
+
 def joint_axes(arm: Embodiment, frames: Sequence[JointFrame]) -> list[Vector]:
     """Unit axes of the joints in the base frame.
 

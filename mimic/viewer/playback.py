@@ -48,6 +48,7 @@ class Playback:
             expert=dict(zip(env.expert.joint_names, map(float, rollout.expert[frame_index]), strict=True)),
             learner=dict(zip(env.learner.joint_names, map(float, rollout.learner[frame_index]), strict=True))
             | self._locked,
+            locked=tuple(self._locked),
             expert_links=env.expert.link_names,
             learner_links=env.learner.link_names,
             distance=float(rollout.distance[step]),

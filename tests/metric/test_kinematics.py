@@ -14,6 +14,7 @@ from mimic.arms.embodiment import load_mjcf, panda, panda_path, planar_arm
 from mimic.arms.model_files import read_model
 from mimic.metric.kinematics import (
     LONG,
+    body_twists,
     candidate_points,
     forward_kinematics,
     link_state_table,
@@ -59,6 +60,7 @@ def assert_moves_as_in_mujoco(arm, model, dtype, locked=None):
     qpos, qvel = (x[0].astype(dtype) for x in motions(arm.num_joints))  # MuJoCo gets the rounded numbers too
     states = link_states(arm, qpos, qvel, normalized=False)
     frames = forward_kinematics(arm, qpos)
+    twists = np.asarray(body_twists(arm, qpos, qvel))
     data = random_arms.posed(model, *full_motion(model, arm, qpos, qvel, locked))
     rest = random_arms.posed(model, full_motion(model, arm, 0, 0, locked)[0])
     expected = random_arms.links(model, data, arm.link_names)
@@ -71,6 +73,9 @@ def assert_moves_as_in_mujoco(arm, model, dtype, locked=None):
     np.testing.assert_allclose(rotation[:, :, 0], expected["direction"], **close)
     turn = body_rotation @ np.swapaxes(body_rest_rotation, 1, 2)
     np.testing.assert_allclose(rotation, turn @ arm.link_rotation, **close)
+    for part, field in ((slice(0, 3), "angular_velocity"), (slice(3, 6), "linear_velocity")):
+        in_link_frame = np.einsum("nji,nj->ni", rotation, expected[field])
+        np.testing.assert_allclose(twists[:, part], in_link_frame, err_msg=f"body twist, {field}", **close)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -130,7 +135,7 @@ def test_panda_moves_as_in_mujoco(x64, links, locked):
 def test_planar_arm_has_the_closed_form(x64, lengths, frame_at):
     arm = planar_arm(lengths, frame_at=frame_at)
     (qpos, *_), (qvel, *_) = motions(arm.num_joints)
-    states = link_states(arm, qpos, qvel)
+    states, twists = link_states(arm, qpos, qvel), body_twists(arm, qpos, qvel)
     joint, velocity, angle, rate = np.zeros(2), np.zeros(2), 0.0, 0.0
     rounding = 1e-14 * max(1, arm.num_joints / 4) ** 2  # 10 roundings of speeds, which add up along the arm
     for i, length in enumerate(lengths):
@@ -145,6 +150,8 @@ def test_planar_arm_has_the_closed_form(x64, lengths, frame_at):
         }
         for field, values in expected.items():
             np.testing.assert_allclose(getattr(states, field)[i], values, atol=rounding, err_msg=field)
+        in_link_frame = [velocity @ along, velocity @ across + reach * rate, 0]
+        np.testing.assert_allclose(twists[i], [0, 0, rate, *in_link_frame], atol=rounding)
         joint, velocity = joint + length * along, velocity + length * rate * across
 
 
@@ -161,7 +168,7 @@ def test_states_at_rest_and_unnormalized():
     np.testing.assert_array_equal(points.position, rest.position)
 
 
-@pytest.mark.parametrize("function", [forward_kinematics, link_states])
+@pytest.mark.parametrize("function", [forward_kinematics, link_states, body_twists])
 def test_a_batch_is_a_vmap_is_a_loop(function):
     """Batch axes come first, and broadcast."""
     arm = planar_arm([0.4, 0.6])
@@ -174,7 +181,9 @@ def test_a_batch_is_a_vmap_is_a_loop(function):
         jax.tree.map(lambda a, b, k=k: np.testing.assert_array_equal(a[k, 0], b), batch, first)
 
 
-@pytest.mark.parametrize(("function", "joints"), [(forward_kinematics, 3), (link_states, 3), (link_states, LONG + 2)])
+@pytest.mark.parametrize(
+    ("function", "joints"), [(forward_kinematics, 3), (link_states, 3), (body_twists, 3), (link_states, LONG + 2)]
+)
 def test_jit_takes_the_arm_as_an_argument(function, joints):
     arm = load_mjcf(random_arms.random_arm(11, joints))
     (qpos, *_), (qvel, *_) = (x.astype(np.float32) for x in motions(joints))
@@ -199,7 +208,7 @@ def test_jit_takes_the_arm_as_an_argument(function, joints):
 @pytest.mark.parametrize("arm", [planar_arm([0.4, 0.6]), panda(locked=(2, 3, 4, 5, 6, 7))], ids=lambda arm: arm.name)
 def test_float32_stays_float32_under_x64(x64, arm):
     q32 = jnp.ones(arm.num_joints, jnp.float32)
-    results = forward_kinematics(arm, q32), link_states(arm, q32, q32)
+    results = forward_kinematics(arm, q32), link_states(arm, q32, q32), body_twists(arm, q32, q32)
     assert {x.dtype for x in jax.tree.leaves(results)} == {jnp.dtype("float32")}
     assert link_states(arm, q32.astype(jnp.float64)).position.dtype == jnp.float64
 
@@ -221,8 +230,9 @@ def test_wrong_shapes_are_rejected(unchecked, shape):
         "qpos": [
             lambda: forward_kinematics(arm, bad),
             lambda: link_states(arm, bad),
+            lambda: body_twists(arm, bad, good),
         ],
-        "qvel": [lambda: link_states(arm, good, bad)],
+        "qvel": [lambda: link_states(arm, good, bad), lambda: body_twists(arm, good, bad)],
     }.items():
         for function in call:
             with pytest.raises(
