@@ -22,9 +22,6 @@ if TYPE_CHECKING:
 
 _COLOURS = {"train": "tab:blue", "held_out": "tab:orange"}
 _LABELS = {split: name.replace(" ", "-") for split, name in SPLIT_NAMES.items()}  # adjectives: held-out demonstrations
-_MARKERS = ("o", "tab:blue"), ("^", "tab:orange")  # of an arm's metrics
-_ARM_WIDTH, _MIN_WIDTH = 0.17, 3.0  # inches, of an arm's column and of a panel
-_LINEAR = 0.1  # %: values below it are on a linear axis, as a result at the optimum has the value 0
 
 
 def plot_training(folder: Path, metric: str, label: str, *, labels: Mapping[str, str], title: str) -> None:
@@ -127,44 +124,6 @@ def plot_similarity(similarity: Mapping[str, Mapping[str, Mapping[str, float]]],
         f"{title}: similarity of the motions (0 is identical), with baselines without learning",
         out,
     )
-
-
-def plot_arms(
-    arms: Mapping[str, Mapping[str, Any]], series: Mapping[str, str], out: Path, *, label: str, title: str
-) -> None:
-    """Plots metrics of each arm in percent, in one panel the arms that training has seen, in another the others.
-
-    Args:
-      arms: metrics of each arm by its name, and whether it was `seen`. An arm whose first metric is NaN is left out.
-      series: keys of the metrics with their labels; the arms are in the order of the first one.
-      out: file of the plot; not written where no arm is left.
-      label: of the values.
-      title: of the plot.
-    """
-    first = next(iter(series))
-    names = sorted((n for n in arms if np.isfinite(arms[n][first])), key=lambda name: arms[name][first])
-    parts = {seen: [name for name in names if arms[name]["seen"] == seen] for seen in (True, False)}
-    parts = {seen: part for seen, part in parts.items() if part}
-    if not parts:
-        return
-    widths = [max(_ARM_WIDTH * len(part), _MIN_WIDTH) for part in parts.values()]
-    figure, all_axes = plt.subplots(
-        1, len(parts), figsize=(sum(widths) + 1, 4.5), sharey=True, layout="constrained", squeeze=False,
-        width_ratios=widths,
-    )  # fmt: skip
-    for axes, (seen, part) in zip(all_axes[0], parts.items(), strict=True):
-        for (key, text), (marker, colour) in zip(series.items(), _MARKERS, strict=True):
-            percent = [100 * arms[name][key] for name in part]
-            axes.plot(range(len(part)), percent, marker, color=colour, label=text, markersize=5)
-        axes.set_yscale("symlog", linthresh=_LINEAR)
-        axes.set(title="arms seen in training" if seen else "unseen arms", xlim=(-0.7, len(part) - 0.3))
-        axes.set_xticks(range(len(part)), part, rotation=90, fontsize=8)
-        axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
-        axes.grid(alpha=0.3)
-    all_axes[0, 0].set_ylabel(label)
-    figure.suptitle(title)
-    figure.legend(*all_axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
-    _save(figure, out)
 
 
 def _finish(figure: Any, labelled: Any, title: str, out: Path) -> None:

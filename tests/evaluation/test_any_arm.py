@@ -1,4 +1,4 @@
-"""The evaluation of many arms: gaps of chosen rollouts, splits, tables and plots; and the real rollouts and bounds."""
+"""The evaluation of many arms: gaps of chosen rollouts, splits and tables; and the real rollouts and bounds."""
 
 import csv
 import dataclasses
@@ -8,13 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from PIL import Image
 
 from mimic.arms.arrays import MAX_JOINTS
 from mimic.envs.family import SEEN, UNSEEN, report_arms
 from mimic.envs.make import make_env
 from mimic.evaluation.evaluator import Evaluator, Rollouts
-from mimic.evaluation.plots import plot_arms
 from mimic.evaluation.references import CONTROLLER, References
 from tests.helpers.untrained_run import FAMILY, family
 
@@ -87,7 +85,7 @@ def test_a_split_without_arms_is_left_out(env, arms):
     assert evaluator.similarity_summary(OUTCOME, "policy")["policy"]["tangent_angle_deg"].keys() == {"train"}
 
 
-def test_details_tables_and_plots(evaluator, tmp_path):
+def test_details_and_tables(evaluator, tmp_path):
     details = evaluator.details(OUTCOME)
     assert list(details) == NAMES and [arm["seen"] for arm in details.values()] == [True] * 3 + [False] * 5
     assert [arm["joints"] for arm in details.values()] == [7, *[6] * 7]
@@ -95,11 +93,6 @@ def test_details_tables_and_plots(evaluator, tmp_path):
     with (tmp_path / "arms.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["arm"] for row in rows] == NAMES and [row["arms"] for row in rows][2:4] == ["seen", "unseen"]
-    options: Any = {"series": {"gap": "policy", "controller_gap": "none"}, "label": "gap [%]", "title": "family"}
-    plot_arms(details, out=tmp_path / "arms.png", **options)
-    assert min(Image.open(tmp_path / "arms.png").size) > 300
-    plot_arms({}, out=tmp_path / "none.png", **options)
-    assert not (tmp_path / "none.png").exists()
 
 
 def test_similarity_of_the_home_pose_is_that_of_holding(evaluator):

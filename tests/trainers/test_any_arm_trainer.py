@@ -96,7 +96,7 @@ def test_a_run_directory_holds_everything(finished):
     run_dir, printed = finished
     names = {path.name for path in run_dir.iterdir()}
     assert {"config.yaml", "report.json", "metrics.csv", "demonstrations.npz", "checkpoints", "arms.csv"} <= names
-    assert {"arms.png", "training.png"} <= names
+    assert "training.png" in names
     report = json.loads((run_dir / "report.json").read_text())
     assert all(report[key].keys() == {"train", "held_out"} for key in METRICS)
     assert report["physics"] == "fused" and "mjx" not in report

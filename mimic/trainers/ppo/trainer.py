@@ -258,23 +258,19 @@ class PPOTrainer(Trainer):
         """Writes tables and plots of the evaluation; in a run directory also a plot of the training."""
         from mimic.evaluation import plots  # imports matplotlib, which takes a second
 
-        name, label = controller.replace("_", " "), "optimality gap [%]"
         labels = plots.labels_of("demonstrations")
         if self._has_many_arms:
             self.evaluator.save_arms(outcome, folder / "arms.csv")
-            series = {"gap": name, "controller_gap": "controller without learning"}
-            arms = self.evaluator.details(outcome)
-            plots.plot_arms(arms, series, folder / "arms.png", label=label, title=self._name)
             labels = {"train": "arms seen in training", "held_out": "unseen arms"}
         else:
             self.evaluator.save_table(outcome, folder / "demonstrations.csv")
             self.evaluator.save_curves(outcome, folder / "quality.csv")
-            names = {"controller": name, "title": self._name}
+            names = {"controller": controller.replace("_", " "), "title": self._name}
             plots.plot_quality(self.evaluator, outcome, folder / "quality.png", **names)
             plots.plot_demonstrations(self.evaluator, outcome, folder / "demonstrations.png", **names)
             similarity = self.evaluator.similarity_summary(outcome, controller)
             plots.plot_similarity(similarity, folder / "similarity.png", title=self._name)
-        plots.plot_training(folder, "optimality_gap", label, labels=labels, title=self._name)
+        plots.plot_training(folder, "optimality_gap", "optimality gap [%]", labels=labels, title=self._name)
 
 
 def run_environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
