@@ -391,6 +391,8 @@ class ViewConfig:
 
     Attributes:
       env: environment that defines the arms and the metric.
+      mapper: pose mapper that moves the learner instead of the optimiser: a run directory, or the environment
+        of one that comes with mimic. Its arms are used.
       run: run directory of a policy to play. Its arms and demonstrations are used.
       source: motion capture file of a person to play as the expert, or tcp://localhost:PORT, a socket of this machine
         that takes points as lines of JSON.
@@ -400,7 +402,7 @@ class ViewConfig:
       record: new folder for what the hand drives, a LeRobot data set, written at the end. Default "": none.
       arm: "left" or "right" arm of the person in `source`. Default "": right.
       capture: how `source` is read.
-      checkpoint: steps of the checkpoint of the policy. Default None: the last checkpoint.
+      checkpoint: steps of the checkpoint of the policy or the mapper. Default None: the last checkpoint.
       split: "held_out" or "train": demonstrations of the run to show first.
       host: address of the server; 0.0.0.0 is every address of this machine.
       port: port of the server.
@@ -408,6 +410,7 @@ class ViewConfig:
     """
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
+    mapper: str = ""
     run: str = ""
     source: str = ""
     demonstrations: str = ""
@@ -425,15 +428,19 @@ class ViewConfig:
     def __post_init__(self) -> None:
         check_ranges(self)
         check_choice("split", self.split, SPLITS)
+        if self.run and self.mapper:
+            raise ValueError(f"run, mapper: expected one of them, got {self.run!r} and {self.mapper!r}")
         if self.source:
-            check_unused(self, ("run", "demonstrations"), "with source=, whose person is the expert")
+            check_unused(self, ("run", "mapper", "demonstrations"), "with source=, whose person is the expert")
         else:
             check_unused(self, ("arm", "capture"), "without source=")
         if self.arm:
             check_choice("arm", self.arm, ARM_SIDES)
-        check_choice("hand", self.hand, _FOLLOWED)
         if self.run:
-            check_unused(self, ("demonstrations", "hand", "record"), "with run=, whose policy moves the learner")
+            check_unused(self, ("demonstrations",), "with run=, whose motions are shown")
+        check_choice("hand", self.hand, _FOLLOWED)
+        if self.run or self.mapper:
+            check_unused(self, ("hand", "record"), "with run= or mapper=, which move the learner")
         if self.base != "same" and (self.hand == "free" or base_numbers(self.base) is None):
             raise ValueError(
                 "base: expected same or [x,y,z,yaw] with hand=exact or relative; inspect base=auto finds one"

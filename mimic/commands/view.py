@@ -32,12 +32,13 @@ from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.episodes import EXTRA
 from mimic.motions.mocap.live_hand import LiveHand
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.run_config import policy_run
+from mimic.trainers.run_config import check_run_dir, policy_run
 from mimic.viewer.hand_following import HandSettings
 from mimic.viewer.history import RATE
 from mimic.viewer.live_session import LiveSession
 
 if TYPE_CHECKING:
+    from mimic.trainers.pose_mapper.mapper import PoseMapper
     from mimic.viewer.controls import ExpertControls
     from mimic.viewer.page import Page
     from mimic.viewer.playback import Playback
@@ -47,7 +48,7 @@ _NUMBERS_RATE = 15.0  # per second, of the numbers, chart and maps, which cost a
 
 
 def prepare_view(config: ViewConfig, overrides: Sequence[str] = ()) -> Callable[[], int]:
-    """Checks the config of a view and loads its arms or its policy.
+    """Checks the config of a view and loads its arms, its pose mapper or its policy.
 
     Args:
       config: of the view.
@@ -70,6 +71,9 @@ def prepare_view(config: ViewConfig, overrides: Sequence[str] = ()) -> Callable[
         return _prepare_playback(config)
     # Poses take less than it takes to wake a thread of XLA's up, which on busy cores has to wait for its turn.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
+    if config.mapper:
+        check_no_arms(overrides, "with mapper=")
+        return _prepare_mapper(config)
     config.env.check_one_learner()
     if config.source:
         check_no_arms(overrides, "with source=", ("expert",))
@@ -132,6 +136,37 @@ def _finish(config: ViewConfig, session: LiveSession) -> None:
         print(f"view: {recorder.episodes} episodes in {folder}", flush=True)
     if config.record and not session.driven:
         print("view: record: nothing was driven, as by hand=relative or the tab 'Hand'", flush=True)
+
+
+def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
+    """Prepares a view whose learner a pose mapper moves.
+
+    Raises:
+      ValueError: see `PoseMapper.load`.
+    """
+    mapper = _load_mapper(config)
+    return _prepare_live(config, mapper.env, LiveSession(mapper.env, mapper))
+
+
+def _load_mapper(config: ViewConfig) -> "PoseMapper":
+    """The mapper in `mapper`: a run directory, or the name of one that comes with mimic.
+
+    Raises:
+      ValueError: see `PoseMapper.load`.
+    """
+    from mimic.trainers.pose_mapper.mapper import PoseMapper
+    from mimic.trainers.pretrained.network import NETWORKS, pretrained_names, read_network
+
+    run_dir = Path(config.mapper).expanduser()
+    names = pretrained_names("pose_mapper")
+    if config.mapper not in names or run_dir.exists():
+        check_run_dir(run_dir, "mapper", f" or one of {', '.join(names)},")
+        return PoseMapper.load(run_dir, config.checkpoint)
+    if config.checkpoint is not None:
+        raise ValueError(f"checkpoint: expected none with mapper={config.mapper}, which comes with mimic")
+    mapper = read_network(NETWORKS / f"{config.mapper}-pose_mapper", "pose_mapper").function
+    assert isinstance(mapper, PoseMapper)
+    return mapper
 
 
 def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
@@ -200,4 +235,4 @@ def _play(page: "Page", times: Iterator[float], playback: "Playback", split: str
 def _title(config: ViewConfig, env: EnvConfig) -> str:
     if config.run:
         return f"{env.name}: the policy of {Path(config.run).name} moves the learner"
-    return "The optimiser moves the learner"
+    return f"The {'pose mapper' if config.mapper else 'optimiser'} moves the learner"

@@ -80,6 +80,12 @@ def run_schema(trainer: str) -> DictConfig:
     return merged(schema(TrainConfig), {"trainer": schema(trainer_config(trainer))})
 
 
+def check_run_dir(run_dir: Path, key: str, choices: str = "") -> None:
+    """Raises a ValueError with the key and the other choices unless a path is that of a run directory."""
+    if not (run_dir / CONFIG).is_file():
+        raise ValueError(f"{key}: expected a run directory, which has a {CONFIG},{choices} got {str(run_dir)!r}")
+
+
 def load_config(run_dir: Path, key: str = "run_dir", *, saved_models: bool = True) -> TrainConfig:
     """The config of a run.
 
@@ -93,8 +99,7 @@ def load_config(run_dir: Path, key: str = "run_dir", *, saved_models: bool = Tru
       ValueError: no run directory, a config that cannot be read, a plugin that is not loaded, or model files that were
         changed.
     """
-    if not (run_dir / CONFIG).is_file():
-        raise ValueError(f"{key}: expected a run directory, which has a {CONFIG}, got {str(run_dir)!r}")
+    check_run_dir(run_dir, key)
     config = _read_config(run_dir)
     return dataclasses.replace(config, env=with_saved_models(run_dir, config.env)) if saved_models else config
 

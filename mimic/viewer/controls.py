@@ -35,7 +35,7 @@ class LiveControls:
 
     def __init__(self, server: viser.ViserServer, session: LiveSession, env: EnvConfig, expert: ExpertControls):
         self._server, self._session, self._env = server, session, env
-        self._hand = HandControls(session)
+        self._hand = HandControls(session) if session.by_optimiser else None
         tabs = server.gui.add_tab_group()
         with tabs.add_tab("Expert"):
             expert.add_widgets(server)
@@ -43,20 +43,24 @@ class LiveControls:
             self._add_metric()
         with tabs.add_tab("Learner"):
             self._add_locks()
-        with tabs.add_tab("Hand"):
-            self._hand.add_widgets(server)
+        if self._hand is not None:
+            with tabs.add_tab("Hand"):
+                self._hand.add_widgets(server)
 
     def update(self) -> None:
         """Shows the settings of the session, after one that was not possible."""
         self._show_locks()
-        self._hand.update()
+        if self._hand is not None:
+            self._hand.update()
 
     def _add_locks(self) -> None:
         gui, session = self._server.gui, self._session
-        self._locks = {name: gui.add_checkbox(f"lock {name}", False) for name in session.joints}
+        self._locks = {
+            name: gui.add_checkbox(f"lock {name}", False, disabled=not session.by_optimiser) for name in session.joints
+        }
         for name, box in self._locks.items():
             box.on_update(by_user(lambda value, name=name: self._lock(name, value)))
-        self._note = gui.add_markdown("")
+        self._note = gui.add_markdown("", visible=session.by_optimiser)
         self._show_locks()
 
     def _lock(self, name: str, is_locked: bool) -> None:

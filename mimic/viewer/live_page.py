@@ -41,13 +41,13 @@ def show_live(
             frame, was_compiling = new_frame or frame, compiling
         if frame is not None and is_behind and since_numbers * numbers_rate >= 1:
             history.add(frame)
-            page.show(frame, history.chart(), _note(frame, compiling))
+            page.show(frame, history.chart(), _note(frame, compiling, live.by_optimiser))
             is_behind, since_numbers = False, 0.0
         elif frame is not None and changed:
             page.move(frame)
 
 
-def _note(frame: Frame, compiling: bool) -> str:
+def _note(frame: Frame, compiling: bool, by_optimiser: bool) -> str:
     if compiling:
         return "compiling …"
     if frame.hand is not None:
@@ -55,4 +55,4 @@ def _note(frame: Frame, compiling: bool) -> str:
     excess = frame.distance - frame.bound
     if excess <= _AT_BOUND * max(frame.distance, _AT_BOUND):
         return "at the kinematic bound"
-    return f"{excess:.4f} above the bound: moving, or in a local minimum"
+    return f"{excess:.4f} above the bound: " + ("moving, or in a local minimum" if by_optimiser else "pose mapper")

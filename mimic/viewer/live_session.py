@@ -17,6 +17,7 @@ from mimic.viewer.hand_following import FREE, HandDrag, HandFollower, HandFrame,
 from mimic.viewer.tracking import (
     CompiledFunctions,
     FunctionCache,
+    Mapper,
     PoseComparison,
     Settings,
     home_angles,
@@ -66,23 +67,32 @@ class LiveSession:
 
     Args:
       env: environment that defines the arms and the metric.
+      mapper: pose mapper that moves the learner instead of the optimiser.
       hand: how the learner's hand follows, at the start.
       is_recorded: whether what the hand drives is kept.
 
     Attributes:
       expert: embodiment of the expert.
       settings: requested settings; they take effect as soon as their functions are compiled.
-      hand: how the learner's hand follows.
+      hand: how the learner's hand follows, with the optimiser.
+      by_optimiser: whether the optimiser moves the learner, not a pose mapper, whose joints cannot be locked.
 
     Raises:
       ValueError: an arm is invalid.
     """
 
-    def __init__(self, env: EnvConfig, hand: HandSettings | None = None, is_recorded: bool = False):
+    def __init__(
+        self,
+        env: EnvConfig,
+        mapper: Mapper | None = None,
+        hand: HandSettings | None = None,
+        is_recorded: bool = False,
+    ):
         self.hand: HandSettings = hand or HandSettings()
         self.expert: Embodiment = env.build_arm("expert").embodiment
         self.settings: Settings = initial_settings(env)
-        self._functions = FunctionCache(env)
+        self.by_optimiser = mapper is None
+        self._functions = FunctionCache(env, mapper)
         self._lock_angles = lock_angles(env)
         self._lock = threading.RLock()
         self._angles = {**home_angles(env), **self.settings.locked}  # of all joints of the learner [rad]
@@ -148,7 +158,7 @@ class LiveSession:
     def seek(self) -> None:
         """Moves the learner to the best pose of many initial guesses before it tracks again; for motions that jump."""
         with self._lock:
-            self._seeks = True
+            self._seeks = self.by_optimiser
 
     def glide(self, pose: Float[np.ndarray, " joints"]) -> None:
         """Moves the expert to a pose [rad] within a second."""
@@ -334,7 +344,7 @@ class LiveSession:
         pose, is_there = step_towards(arm, current, goal, jump)
         if self._goal is not None:
             self._goal, self._seeks = (None, False) if is_there else (self._goal, self._seeks)
-        elif is_there and self._rest_time > _REST_TIME:
+        elif is_there and self.by_optimiser and self._rest_time > _REST_TIME:
             distance = float(functions.compare(self._pose, pose, weights).distance)
             if distance - bound > _MIN_GAIN * max(distance, _MIN_GAIN):
                 self._goal = best

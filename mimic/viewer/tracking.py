@@ -21,6 +21,8 @@ from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line, similarity
 from mimic.retargeting.pose import imitate_pose, wrap_angles
 
+Mapper = Callable[[Array], Array]  # pose of the expert -> pose of the learner [rad]
+
 _MAX_COMPILED = 16  # sets of functions that are kept; each takes some MB
 _TRACKING_ITERATIONS = 8  # Newton steps from the current pose, which is close: sliders move in small steps
 
@@ -117,12 +119,13 @@ def lock_angles(env: EnvConfig) -> Mapping[str, float]:
     return {**home_angles(env), **env.build_arm("learner").locked}
 
 
-def compile_functions(env: EnvConfig, settings: Settings) -> Iterator[CompiledFunctions]:
+def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None = None) -> Iterator[CompiledFunctions]:
     """Compiles the functions, which takes seconds; yields them first without `best`, then with it.
 
     Args:
       env: environment that defines the arms and the other settings of the metric.
       settings: settings of the viewer, see `Settings.compilation_key`.
+      mapper: pose mapper that moves the learner instead of the optimiser.
 
     Raises:
       ValueError: the locked joints are invalid.
@@ -133,6 +136,8 @@ def compile_functions(env: EnvConfig, settings: Settings) -> Iterator[CompiledFu
     metric = _metric_of_weights(env, settings, expert, learner)
 
     def track(qpos: Array, current: Array, weights: Array) -> Array:
+        if mapper is not None:
+            return mapper(qpos)
         options = {"warm_start": current, "iterations": _TRACKING_ITERATIONS, **metric(weights).arguments}
         return imitate_pose(expert, learner, qpos, **options).qpos
 
@@ -178,8 +183,8 @@ def _compiled(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
 class FunctionCache:
     """Compiled functions by settings, compiled in a background thread, one set at a time."""
 
-    def __init__(self, env: EnvConfig):
-        self._compile = functools.partial(compile_functions, env)
+    def __init__(self, env: EnvConfig, mapper: Mapper | None = None):
+        self._compile = functools.partial(compile_functions, env, mapper=mapper)
         self._results: dict[Any, CompiledFunctions | Exception] = {}
         self._running: Background[None] | None = None
 

@@ -9,6 +9,8 @@ import mimic
 from mimic.arms.arm import ArmConfig, build_arm, finite_velocity_limit
 from mimic.arms.link_match import hand_poses
 from mimic.envs import env_config
+from mimic.trainers import run_training as train
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.tracking import Settings, initial_settings, learner_arm, step_towards
 
@@ -191,6 +193,22 @@ def test_locked_joints_switch_the_learner(env):
     assert session.settings.locked == {"joint6": 0.0, "joint3": 0.4}
     with pytest.raises(ValueError, match="joint9"):
         learner_arm(env, {"joint9": 0.0})
+
+
+@pytest.mark.slow
+def test_a_trained_mapper_moves_the_learner(tmp_path):
+    tiny = {"samples": 256, "batch_size": 128, "epochs": 1, "hidden_layers": [8], "held_out_poses": 32}
+    trainer = PoseMapperConfig(**tiny, evaluations=1, validation_poses=32)
+    env = env_config("planar4dof")
+    config = TrainConfig(env, trainer, run_dir=str(tmp_path / "run"), compilation_cache="")
+    assert train.prepare_training(config, 0.0)() == 0
+    mapper = mimic.PoseMapper.load(tmp_path / "run")
+    session = LiveSession(env, mapper)
+    session.compile()
+    session.move(2, 0.7)
+    frame = settle(session)
+    np.testing.assert_allclose(list(frame.learner.values()), mapper(session.pose), atol=1e-4)  # float32, two functions
+    assert frame.bound < frame.distance  # it has hardly learned anything
 
 
 def test_locking_the_last_joint_is_rejected_and_undone():
