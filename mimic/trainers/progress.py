@@ -34,6 +34,8 @@ class TrainingProgress:
         if is_animated(self._console):
             self._live = Live(get_renderable=self._lines, console=self._console, refresh_per_second=_REFRESHES)
             self._live.start()
+        else:
+            self._console.print(self._status, highlight=False)  # for a minute
         return self
 
     def __exit__(self, *_: Any) -> None:

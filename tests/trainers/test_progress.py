@@ -95,7 +95,7 @@ def on_dumb_terminal(monkeypatch):
 
 
 @pytest.mark.parametrize("make_console", [as_pipe, in_notebook, on_dumb_terminal])
-def test_without_a_terminal_there_is_line_for_each_evaluation(monkeypatch, clock, make_console):
+def test_without_a_terminal_there_is_a_line_for_compiling_and_each_evaluation(monkeypatch, clock, make_console):
     console = make_console(monkeypatch)
     assert console.is_terminal
     with TrainingProgress(console, 1000) as shown:
@@ -103,6 +103,7 @@ def test_without_a_terminal_there_is_line_for_each_evaluation(monkeypatch, clock
             clock[0] += 60
             shown.update(step, STATUS, 10.0)
     assert written(console).splitlines() == [
+        "compiling",
         f"step           0  {STATUS}  10 steps/s  elapsed 1:00  left 1:40",
         f"step         500  {STATUS}  10 steps/s  elapsed 2:00  left 0:50",
         f"step       1,000  {STATUS}  10 steps/s  elapsed 3:00  left 0:00",
