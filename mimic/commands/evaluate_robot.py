@@ -95,10 +95,10 @@ def _check(config: EvaluateConfig, trained: TrainConfig) -> None:
     if trained.trainer.name != "ppo" or trained.env.kind == "sampled_arms":
         raise ValueError(f"robot: expected a run of trainer=ppo with one learner, got env={trained.env.name} and "
                          f"trainer={trained.trainer.name}")  # fmt: skip
-    if config.robot == "virtual_panda" and trained.env.learner.model != "panda":
-        raise ValueError("robot: expected virtual_robot for another learner than a Panda, got virtual_panda")
     if trained.env.kind != "inner_loop":
         raise ValueError("robot: expected a run with an inner loop, as of world=hardware, got one without")
+    if config.robot == "virtual_panda" and trained.env.learner.model != "panda":
+        raise ValueError("robot: expected virtual_robot for another learner than a Panda, got virtual_panda")
     check_supported(trained.env.control, trained.env.control_dt)
 
 

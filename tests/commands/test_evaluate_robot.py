@@ -149,8 +149,9 @@ def test_an_exported_policy_is_the_policy(hardware_run):
         past = np.concatenate([expected, past[:, : -env.action_size]], axis=1)
 
 
-def test_a_run_without_an_inner_loop_has_no_controller_and_no_robot(tmp_path):
-    trained = TrainConfig(mimic.env_config("panda7dof"), PPOConfig())
+@pytest.mark.parametrize("env", ["panda7dof", "planar4dof"])
+def test_a_run_without_an_inner_loop_has_no_controller_and_no_robot(tmp_path, env):
+    trained = TrainConfig(mimic.env_config(env), PPOConfig())
     save_config(tmp_path, trained)
     with pytest.raises(ValueError, match="format=controller: expected a run of trainer=ppo with an inner loop"):
         prepare_controller(tmp_path)

@@ -8,6 +8,7 @@ import itertools
 import json
 import os
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -107,7 +108,7 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
         """Composes the runs of a sweep; writes nothing.
 
         Raises:
-          HydraException: a run cannot be composed.
+          HydraException: a run cannot be composed, or several have one run directory.
         """
         assert self.config is not None and self.hydra_context is not None
         loader = self.hydra_context.config_loader
@@ -123,6 +124,12 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
             run_dir, added = _run_dir(config, folder, f"{number:0{width}d}")
             label = " ".join(override for override in overrides if override not in shared)
             runs.append(PlannedRun(label or f"run {number}", [*overrides, *added], run_dir))
+        counts = Counter(run.run_dir for run in runs if run.run_dir)
+        for path in [path for path, count in counts.items() if count > 1]:
+            raise HydraException(
+                f"run_dir: expected a folder of its own for each run, got {path!r} for {counts[path]} of them; "
+                "hydra.sweep.dir=DIR is the folder of a sweep"
+            )
         return runs
 
     def _report(self, folder: Path, planned: Sequence[PlannedRun], outcomes: Sequence[Outcome]) -> None:

@@ -92,6 +92,10 @@ def test_a_failed_run_is_named_and_the_rest_is_kept(launcher, tmp_path, slurm):
             ["-m", "hydra/launcher=submitit_local", "hydra.launcher.parallel=0"],
             "a whole number from 1 to 1,000, got 0",
         ),
+        (
+            ["-m", "seed=0,1", "run_dir=x"],
+            "run_dir: expected a folder of its own for each run, got 'x' for 2 of them; hydra",
+        ),
     ],
 )
 def test_bad_sweeps_write_nothing(rejected, arguments, message):
