@@ -116,6 +116,8 @@ def explain(error: Exception) -> str:
         return f"{null[1] or key}: expected a value, got null"
     if wrong := _WRONG_SCALAR.fullmatch(message):
         return f"{of_key}expected {_SCALARS[wrong[2] or wrong[3]]}, got {_as_written(wrong[1])}"
+    if re.fullmatch(r"Cannot assign \w+ to Dict\[.*\]", message):
+        return f"{of_key}expected names and values, as in {key}={{NAME:VALUE}}"
     if "is not a ListConfig" in message:
         return f"{of_key}expected a list, as in {key}=[VALUE]"
     if "DictConfig with ListConfig" in message:

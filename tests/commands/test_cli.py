@@ -21,6 +21,7 @@ from tests.helpers.repository import REPOSITORY
         (["env.observation=[twist]"], "env.observation: expected a list where it is one, as in [VALUE], and else keys"),
         (["env.observation.terms=x"], "env.observation.terms: expected a list, as in env.observation.terms=[VALUE]\n"),
         (["env.observation.terms=[null]"], "env.observation.terms[0]: expected a text, got null\n"),
+        (["env.reward.terms=3"], "expected names and values, as in env.reward.terms={NAME:VALUE}\n"),
         (["env.horizon=null"], "env.horizon: expected a value, got null\n"),
         (["seed=one"], "seed: expected a whole number, got 'one'\n"),
         (["trainer.num_timesteps=1e6"], "expected a whole number, got 1000000.0; write 1000000\n"),
