@@ -111,7 +111,7 @@ def test_a_relative_reward_compares_with_the_zero_action(compared, four_joints, 
     step, still = jax.jit(compared.step), jnp.zeros(compared.action_size)
     start = compared.begin(compared.start_of(four_joints, 0, jax.random.PRNGKey(0)))
     at_rest = step(step(start, still), still)
-    assert at_rest.reward == 0
+    assert float(at_rest.reward) == pytest.approx(0, abs=1e-6)
     state, size = start, 0.0
     for index in range(3):
         before, state = any_arm_state(state), step(state, 0.3 * jnp.ones(compared.action_size))
