@@ -115,7 +115,8 @@ def explain(error: Exception) -> str:
     if null := re.fullmatch(r"field '(.*)' is not Optional|Incompatible value 'None' for field of type '\w+'", message):
         return f"{null[1] or key}: expected a value, got null"
     if wrong := _WRONG_SCALAR.fullmatch(message):
-        return f"{of_key}expected {_SCALARS[wrong[2] or wrong[3]]}, got {_as_written(wrong[1])}"
+        value = repr(wrong[1]) if wrong[3] else _as_written(wrong[1])
+        return f"{of_key}expected {_SCALARS[wrong[2] or wrong[3]]}, got {value}"
     if re.fullmatch(r"Cannot assign \w+ to Dict\[.*\]", message):
         return f"{of_key}expected names and values, as in {key}={{NAME:VALUE}}"
     if "is not a ListConfig" in message:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import pose_limits
 from mimic.base.compilation import UNOPTIMIZED, compiled_once, on_host, value_key
 from mimic.control import clearance
 from mimic.metric.capsule_distances import clearance_constants, colliding_pairs
@@ -45,7 +46,7 @@ def start_poses(
     poses = np.tile(np.asarray(learner.home, np.float32), (len(qpos), 1))
     elsewhere = ~np.isclose(qpos, np.asarray(expert.home), rtol=0, atol=_AT_HOME).all(axis=1)
     if value_key(expert) == value_key(learner):
-        poses[elsewhere] = qpos[elsewhere]
+        poses[elsewhere] = np.clip(qpos[elsewhere], *pose_limits(learner, np.float32))  # measured angles may be outside
     elif elsewhere.any():
         poses[elsewhere] = _nearest_poses(expert, learner, qpos[elsewhere], metric)
     if capsules is not None:  # again where links come near each other: a pose then takes 100 times as long

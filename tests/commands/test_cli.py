@@ -29,6 +29,7 @@ from tests.helpers.repository import REPOSITORY
         (["env.horizon=true"], "env.horizon: expected a whole number, got 'True'\n"),
         (["env.control_dt=x"], "env.control_dt: expected a number, got 'x'\n"),
         (["env.metric.adaptive=maybe"], "env.metric.adaptive: expected true or false, got 'maybe'\n"),
+        (["env.metric.adaptive=2.0"], "env.metric.adaptive: expected true or false, got '2.0'\n"),
         (["+foo=1"], "foo"),
         (["trainer=pose_mapper", "trainer.num_envs=8"], "unknown key 'trainer.num_envs'; valid are name, preset"),
         (["env=panda4dfo"], "; did you mean panda4dof?\n"),

@@ -87,6 +87,15 @@ def test_the_learner_starts_at_home_where_the_expert_does():
 
 
 @pytest.mark.slow
+def test_the_experts_own_arm_starts_in_its_pose_within_its_range():
+    """A measured angle may lie beyond the range."""
+    arm = mimic.build_arm(mimic.ArmConfig("panda"), limits="hardware").embodiment
+    lower, upper = np.asarray(arm.joint_range).T
+    qpos = np.stack([0.5 * (lower + upper), upper + 0.01])
+    poses = start_poses(arm, arm, qpos, {})
+    np.testing.assert_allclose(poses, [0.5 * (lower + upper), upper], atol=1e-6)
+
+
 def test_an_arm_that_is_charged_for_self_collision_starts_without():
     env = mimic.make("panda7dof", physics="fused", reward={"terms": {"self_collision": 1.0}}, **SETTINGS)
     qpos = np.zeros((2, 7))
