@@ -27,6 +27,7 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from numpy.random import Generator
@@ -78,10 +79,6 @@ def read_models(folder: Path, changed: Path) -> Any:
     return read_model(file).names
 
 
-def read_captures(folder: Path, changed: Path) -> Any:
-    return vars(read_motion(changed))
-
-
 def read_runs(folder: Path, changed: Path) -> Any:
     find_runs(folder)
     config = load_config(folder / "run")
@@ -110,15 +107,12 @@ def read_command_lines(folder: Path, changed: Path) -> Any:
         return lambda: 0
 
     code: Any = 0
-    out, error, previous = io.StringIO(), io.StringIO(), sys.argv
-    sys.argv = [f"mimic.{command}", *arguments]
-    try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
+    out, error, line = io.StringIO(), io.StringIO(), [f"mimic.{command}", *arguments]
+    with mock.patch("sys.argv", line), contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
+        try:
             cli.run(prepare, command)
-    except SystemExit as stop:
-        code = stop.code or 0
-    finally:
-        sys.argv = previous
+        except SystemExit as stop:
+            code = stop.code or 0
     numbers = [x for config in configs for x in flatten(to_dict(config)).values() if isinstance(x, float)]
     if not all(map(math.isfinite, numbers)):
         raise RuntimeError(f"a number that is not finite in {configs}")
@@ -133,7 +127,7 @@ def read_command_lines(folder: Path, changed: Path) -> Any:
 KINDS: dict[str, tuple[Callable[[Path], None], Callable[[Path, Path], Any]]] = {  # write a valid example; read it
     "motions": (valid_files.write_motions, read_motions),
     "models": (valid_files.write_models, read_models),
-    "captures": (valid_files.write_captures, read_captures),
+    "captures": (valid_files.write_captures, lambda folder, changed: vars(read_motion(changed))),
     "runs": (valid_files.write_runs, read_runs),
     "command_lines": (valid_files.write_command_lines, read_command_lines),
 }
