@@ -125,7 +125,7 @@ def arm_motion(
     parents: list[int] = []
     start, end = [], []
     for arm in sides(side):
-        points = _link_ends(motion, arms[arm], origin, frames, trunk)
+        points = link_ends(motion, arms[arm], origin, frames, trunk)
         links = ((TRUNK,) if trunk else ()) + ARM_LINKS
         links = links[: points.shape[1] - 1]
         parents += [-1, *range(len(names), len(names) + len(links) - 1)]
@@ -137,31 +137,23 @@ def arm_motion(
     return LinkMotion(tuple(names), tuple(parents), *points, motion.rate, name or default)
 
 
-def link_ends_from_shoulder(
-    motion: PointMotion, arm: ArmPoints, *, facing: dict[str, tuple[str, ...]], trunk: float, cutoff: float
-) -> Float[np.ndarray, "time ends 3"]:
-    """Ends of the links of one arm in its base frame, in the order of the chain [m]; arguments as for `arm_motion`.
-
-    Raises:
-      ValueError: a point is missing at some time.
-    """
-    origin = mean_point(motion, arm.shoulder)
-    return _link_ends(motion, arm, origin, facing_frames(motion, facing, cutoff), trunk)
-
-
 def sides(side: str) -> tuple[str, ...]:
     """The sides of "left", "right" or "both"."""
     return SIDES if side == BOTH else (side,)
 
 
-def _link_ends(
+def link_ends(
     motion: PointMotion,
     arm: ArmPoints,
     origin: Float[np.ndarray, "time 3"],
     frames: Float[np.ndarray, "time 3 3"],
     trunk: float,
 ) -> Float[np.ndarray, "time ends 3"]:
-    """Lower end of the trunk if it has a length, shoulder, elbow, wrist and, if it was captured, hand, in frames."""
+    """Lower end of the trunk if it has a length, shoulder, elbow, wrist and, if it was captured, hand, in frames [m].
+
+    Raises:
+      ValueError: a point is missing at some time.
+    """
     groups = [group for group in (arm.shoulder, arm.elbow, arm.wrist, arm.hand) if group]
     points = np.stack([mean_point(motion, group) for group in groups], axis=1)
     if not np.all(np.isfinite(points)):

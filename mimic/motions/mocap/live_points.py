@@ -16,8 +16,8 @@ from jaxtyping import Float
 from mimic.motions.mocap.arms import find_arms, unnamed
 from mimic.motions.mocap.ball_chain import ball_chain_pose
 from mimic.motions.mocap.clips import turn_matrix, turned
-from mimic.motions.mocap.conventions import UNITS, arm_length, find_up, guessed_units, z_up
-from mimic.motions.mocap.link_motion import LinkMotion, arm_motion, link_ends_from_shoulder
+from mimic.motions.mocap.conventions import UNITS, arm_length, find_up, guessed_units, mean_point, z_up
+from mimic.motions.mocap.link_motion import LinkMotion, arm_motion, facing_frames, link_ends
 from mimic.motions.mocap.live_hand import LiveHand, is_number, parse_hand
 from mimic.motions.mocap.points import ArmPoints, PointMotion
 from mimic.motions.mocap.reading import one_person, with_arm
@@ -139,9 +139,9 @@ class LiveArm:
           ValueError: points coincide, so that a link has no direction, or links have other lengths than before.
         """
         assert self.zero is not None, "the arm has no zero pose"
-        ends = link_ends_from_shoulder(
-            self._body([sample]), self.arms[self.side], facing=self._facing, trunk=self.trunk, cutoff=np.inf
-        )[0]
+        body, arm = self._body([sample]), self.arms[self.side]
+        frames = facing_frames(body, self._facing, np.inf)
+        ends = link_ends(body, arm, mean_point(body, arm.shoulder), frames, self.trunk)[0]
         span = np.diff(ends, axis=0) @ turn_matrix(*self.turn).T
         length = np.linalg.norm(span, axis=1, keepdims=True)
         if length.min() < _SHORTEST:

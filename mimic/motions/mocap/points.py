@@ -92,14 +92,10 @@ def gaps(motion: PointMotion) -> list[tuple[int, int]]:
     return intervals(~np.isfinite(motion.positions).all(axis=(1, 2)))
 
 
-def bridge_gaps(motion: PointMotion, longest: float = GAP) -> tuple[list[PointMotion], int]:
+def bridge_gaps(motion: PointMotion) -> tuple[list[PointMotion], int]:
     """The parts of a motion in which all points are known, and the number of bridged gaps.
 
-    Gaps between two known samples are bridged linearly up to a length; longer ones split the motion.
-
-    Args:
-      motion: the motion.
-      longest: maximum length of a bridged gap [s].
+    Gaps between two known samples of at most 0.2 s are bridged linearly; longer ones split the motion.
     """
     positions = motion.positions.copy()
     count, bridged = len(positions), 0
@@ -107,7 +103,7 @@ def bridge_gaps(motion: PointMotion, longest: float = GAP) -> tuple[list[PointMo
         track = positions[:, index]
         missing = ~np.isfinite(track).all(axis=1)
         for start, length in intervals(missing):
-            if start > 0 and start + length < count and length / motion.rate <= longest:
+            if start > 0 and start + length < count and length / motion.rate <= GAP:
                 fraction = np.arange(1, length + 1)[:, None] / (length + 1)
                 track[start : start + length] = (1 - fraction) * track[start - 1] + fraction * track[start + length]
                 bridged += 1

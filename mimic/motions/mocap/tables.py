@@ -9,12 +9,12 @@ import numpy as np
 
 from mimic.base.files import read_text
 from mimic.base.npz import read_arrays
+from mimic.motions.formats.names import UNSEEN
 
 _MAX_POINTS = 2000
 _MAX_VALUE = 1e9
 _COLUMN = re.compile(r"(.+?)[ ._:]*([xyz])(?:\s*[\[(](.+)[\])])?", re.IGNORECASE)
 _TIME = re.compile(r"(time|t|timestamp|seconds)([ _]*[\[(]?(s|sec|seconds|ms|us|ns)[\])]?)?", re.IGNORECASE)
-_UNSEEN = {"", "-", "--", "null", "none", "na", "n/a", "missing"}  # cells of a point that was not seen
 _ARRAYS = ("names", "positions", "time", "rate", "parents", "unit", "up")
 
 
@@ -199,7 +199,7 @@ def _cells(rows: list[list[str]], what: str, columns: list[int] | None = None) -
     if not rows:
         raise ValueError("expected at least 2 samples, got 0")
     chosen = rows if columns is None else [[row[column] for column in columns] for row in rows]
-    cells = ["nan" if cell.strip().lower() in _UNSEEN else cell for row in chosen for cell in row]
+    cells = ["nan" if cell.strip().lower() in UNSEEN else cell for row in chosen for cell in row]
     return numbers(cells, what).reshape(len(chosen), -1)
 
 
