@@ -12,15 +12,15 @@ import jax
 from rich.console import Console
 
 from mimic.base import compat
-from mimic.base.config import new_folder
+from mimic.base.config import new_path
 from mimic.base.distribution import import_extra
 from mimic.commands.arm_keys import check_no_arms
 from mimic.commands.config import ViewConfig, base_numbers
 from mimic.commands.view_capture import (
+    SCHEME,
     CapturedExpert,
     clip_expert,
     hand_expert,
-    is_address,
     listen,
     live_expert,
     read_clip,
@@ -34,8 +34,7 @@ from mimic.motions.mocap.live_hand import LiveHand
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.run_config import check_run_dir, policy_run
 from mimic.viewer.hand_following import HandSettings
-from mimic.viewer.history import RATE
-from mimic.viewer.live_session import LiveSession
+from mimic.viewer.live_session import RATE, LiveSession
 
 if TYPE_CHECKING:
     from mimic.trainers.pose_mapper.mapper import PoseMapper
@@ -61,7 +60,7 @@ def prepare_view(config: ViewConfig, overrides: Sequence[str] = ()) -> Callable[
     import_extra("viser", "view", "view")
     check_port(config.host, config.port)
     if config.record:
-        new_folder("record", config.record)
+        new_path("record", config.record)
         import_extra("pyarrow", EXTRA, "record")
     from mimic.base.compilation import use_compilation_cache
 
@@ -77,7 +76,7 @@ def prepare_view(config: ViewConfig, overrides: Sequence[str] = ()) -> Callable[
     config.env.check_one_learner()
     if config.source:
         check_no_arms(overrides, "with source=", ("expert",))
-        return _prepare_captured(config, config.env)
+        return _prepare_captured(config)
     return _prepare_live(config, config.env, _session(config, config.env))
 
 
@@ -169,31 +168,31 @@ def _load_mapper(config: ViewConfig) -> "PoseMapper":
     return mapper
 
 
-def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
+def _prepare_captured(config: ViewConfig) -> Callable[[], int]:
     """Checks the captured person of `source`; the returned function shows it."""
 
     def show(expert: CapturedExpert) -> int:
         live = _session(config, expert.env)
         return _serve_session(config, expert.env, live, lambda: expert.controls(live), CAPTURE_RATE, _NUMBERS_RATE)
 
-    if is_address(config.source):
+    if config.source.startswith(SCHEME):
         listener = listen(config)
 
         def run_live() -> int:
             with contextlib.closing(listener):
-                measured = wait_for_arm(listener, config, env)
+                measured = wait_for_arm(listener, config)
                 if measured is None:
                     return 0
                 if isinstance(measured, LiveHand):
-                    return show(hand_expert(env, listener))
-                with live_expert(env, *measured, listener) as expert:
+                    return show(hand_expert(config.env, listener))
+                with live_expert(config.env, *measured, listener) as expert:
                     return show(expert)
 
         return run_live
-    content = read_clip(config, env)
+    content = read_clip(config)
 
     def run_clip() -> int:
-        with clip_expert(env, *content) as expert:
+        with clip_expert(config.env, *content) as expert:
             return show(expert)
 
     return run_clip

@@ -49,12 +49,7 @@ class CapturedExpert(NamedTuple):
     controls: Callable[[LiveSession], Any]
 
 
-def is_address(source: str) -> bool:
-    """Whether a source is the address of a socket, not a file."""
-    return source.startswith(SCHEME)
-
-
-def read_clip(config: ViewConfig, env: EnvConfig) -> tuple[Clip, LinkMotion, np.ndarray]:
+def read_clip(config: ViewConfig) -> tuple[Clip, LinkMotion, np.ndarray]:
     """The clip in the file `source`, the links of its longest part, and their zero frames.
 
     Raises:
@@ -62,7 +57,7 @@ def read_clip(config: ViewConfig, env: EnvConfig) -> tuple[Clip, LinkMotion, np.
     """
     capture = config.capture
     check_unused(capture, _OF_WINDOWS, "with this source of a view, which cuts no windows", "capture.")
-    fixed = fixed_fraction(env.build_arm("learner").embodiment)
+    fixed = fixed_fraction(config.env.build_arm("learner").embodiment)
     read = read_arm(Path(config.source).expanduser(), config.arm or "right", capture, fixed)
     kept = [index for index, part in enumerate(read.parts) if len(part.start) > 2]
     if not kept:
@@ -142,9 +137,7 @@ def hand_expert(env: EnvConfig, listener: PointListener) -> CapturedExpert:
     return CapturedExpert(env, lambda session: PointControls(session, HandTracker(listener)))
 
 
-def wait_for_arm(
-    listener: PointListener, config: ViewConfig, env: EnvConfig
-) -> tuple[LiveArm, LinkMotion] | LiveHand | None:
+def wait_for_arm(listener: PointListener, config: ViewConfig) -> tuple[LiveArm, LinkMotion] | LiveHand | None:
     """The arm of the person whose points arrive, and its links in the first samples; None after a signal.
 
     A hand is returned as it is.
@@ -152,8 +145,7 @@ def wait_for_arm(
     Points that are no arm's print a line, and it waits for others.
     """
     side, signals, say = config.arm or "right", Signals(), Said()
-
-    fixed = fixed_fraction(env.build_arm("learner").embodiment)
+    fixed = fixed_fraction(config.env.build_arm("learner").embodiment)
     print(f"view: waiting for points at {config.source}   (Ctrl-C ends it)", flush=True)
     arm, samples, incomplete = None, [], 0
     with noted_signals(signals, "view: ending; repeat to stop immediately"):

@@ -13,7 +13,7 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands.config import ViewConfig
 from mimic.envs.config import EnvConfig
 from mimic.runs.signals import Signals, noted_signals
-from mimic.viewer.history import RATE
+from mimic.viewer.live_session import RATE
 from mimic.viewer.origins import is_local
 
 if TYPE_CHECKING:

@@ -1,15 +1,21 @@
 """A live session on its page: the arms at each tick, and the numbers as often as a browser can take."""
 
 import math
+import time
+from collections import deque
 from collections.abc import Iterator
 
+import numpy as np
+
 from mimic.envs.config import EnvConfig
+from mimic.viewer import html
 from mimic.viewer.controls import ExpertControls, LiveControls
-from mimic.viewer.history import History
-from mimic.viewer.live_session import Frame, LiveSession
+from mimic.viewer.live_session import RATE, Frame, LiveSession
 from mimic.viewer.page import Page
 
 _AT_BOUND = 1e-3  # fraction of the distance within which it counts as the bound
+_HISTORY = 15.0  # s, duration of the chart
+_PAUSE = 0.5  # s without an update: the arms were at rest, and the chart is constant there
 
 
 def show_live(
@@ -56,3 +62,25 @@ def _note(frame: Frame, compiling: bool, by_optimiser: bool) -> str:
     if excess <= _AT_BOUND * max(frame.distance, _AT_BOUND):
         return "at the kinematic bound"
     return f"{excess:.4f} above the bound: " + ("moving, or in a local minimum" if by_optimiser else "pose mapper")
+
+
+class History:
+    """Distance and bound of the last seconds."""
+
+    def __init__(self) -> None:
+        self._started = time.perf_counter()
+        self._samples: deque[tuple[float, float, float]] = deque()
+
+    def add(self, frame: Frame) -> None:
+        """Appends the values of the current frame."""
+        now = time.perf_counter() - self._started
+        if self._samples and now - self._samples[-1][0] > _PAUSE:  # the values were constant until just before
+            self._samples.append((now - 1 / RATE, *self._samples[-1][1:]))
+        self._samples.append((now, frame.distance, frame.bound))
+        while self._samples[0][0] < now - _HISTORY:
+            self._samples.popleft()
+
+    def chart(self) -> str:
+        """Both as curves over time, as SVG."""
+        times, distance, bound = np.array(self._samples).T
+        return html.chart(times, [("distance", distance, html.LEARNER), ("bound", bound, html.BOUND)])

@@ -26,6 +26,7 @@ from mimic.viewer.tracking import (
     step_towards,
 )
 
+RATE = 30.0  # frames per second, as in a video
 _GLIDE = 1.0  # s, duration of the expert's motion to the pose of a button
 _REST_TIME = 0.25  # s that the expert rests before the learner may leave a local minimum
 _REST_ANGLE = 1e-4  # rad; a joint that moves less is at rest

@@ -100,7 +100,7 @@ def _visible_parts(model: mujoco.MjModel) -> list[Part]:
         rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
         if mesh is None or model.geom_group[geom] >= _VISIBLE_GROUPS or rgba[3] == 0:
             continue
-        mesh.apply_transform(_transform(model.geom_pos[geom], model.geom_quat[geom]))
+        mesh.apply_transform(pose_matrix(model.geom_pos[geom], model.geom_quat[geom]))
         key = int(model.geom_bodyid[geom]), tuple(float(x) for x in rgba)
         groups.setdefault(key, []).append(mesh)
     return [_part(body, trimesh.util.concatenate(meshes), rgba) for (body, rgba), meshes in groups.items()]
@@ -123,7 +123,10 @@ def quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
 
 def pose_matrix(position: Any, wxyz: Any) -> Float[np.ndarray, "4 4"]:
     """The homogeneous matrix of a position and a quaternion (w, x, y, z)."""
-    return _transform(np.asarray(position, float), np.asarray(wxyz, float))
+    rotation, transform = np.zeros(9), np.eye(4)
+    mujoco.mju_quat2Mat(rotation, np.asarray(wxyz, float))
+    transform[:3, :3], transform[:3, 3] = rotation.reshape(3, 3), position
+    return transform
 
 
 def along_z(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
@@ -165,14 +168,5 @@ def _mark(model: mujoco.MjModel, joint_name: str, reach: float) -> Part:
     """A red disc around a joint's axis, which marks it as locked."""
     joint = model.joint(joint_name)
     disc = trimesh.creation.cylinder(MARK[0] * reach, 2 * MARK[1] * reach, sections=40)
-    quaternion = np.zeros(4)
-    mujoco.mju_quatZ2Vec(quaternion, joint.axis)
-    disc.apply_transform(_transform(joint.pos, quaternion))
+    disc.apply_transform(pose_matrix(joint.pos, along_z(joint.axis)))
     return _part(int(joint.bodyid[0]), disc, LOCKED, joint_name)
-
-
-def _transform(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    rotation, transform = np.zeros(9), np.eye(4)
-    mujoco.mju_quat2Mat(rotation, quaternion)
-    transform[:3, :3], transform[:3, 3] = rotation.reshape(3, 3), position
-    return transform

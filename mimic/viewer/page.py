@@ -57,13 +57,9 @@ class Page:
         self._goals = _HandGoals(server, shapes[1], len(match.learner.hand_joint))
         self._title = html.title(title)
         self._numbers = server.gui.add_html("")
-        self.show_note("compiling …")
+        self._numbers.content = self._title + html.numbers(float("nan"), float("nan"), "compiling …")
         self._chart = server.gui.add_html("")
         self._maps = server.gui.add_html("", order=html.LAST)  # below the controls
-
-    def show_note(self, note: str) -> None:
-        """Shows a line in the place of the numbers, before the first frame."""
-        self._numbers.content = self._title + html.numbers(float("nan"), float("nan"), note)
 
     def move(self, frame: Frame) -> None:
         """Moves the arms to those of a frame; numbers, chart and maps stay."""

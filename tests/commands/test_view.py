@@ -138,7 +138,7 @@ def test_the_arm_of_live_points_is_measured(sends):
     config = ViewConfig(env=env_config("panda4dof"), source=f"tcp://localhost:{free_port()}", arm="left")
     with contextlib.closing(listen(config)) as listener:
         sends(listener.port)
-        measured = wait_for_arm(listener, config, config.env)
+        measured = wait_for_arm(listener, config)
     assert measured is not None and not isinstance(measured, LiveHand)
     arm, links = measured
     assert links.names == ("trunk", "upper_arm", "forearm", "hand") and arm.zero is not None
@@ -152,7 +152,7 @@ def test_poses_of_a_hand_move_the_expert_s():
     config = ViewConfig(env=env_config("panda4dof"), source=f"tcp://localhost:{free_port()}")
     with contextlib.closing(listen(config)) as listener, socket.create_connection(("localhost", listener.port)) as out:
         out.sendall(b'{"time": 0, "hand": {"position": [0, 0, 1], "wxyz": [1, 0, 0, 0]}, "gripper": 0.2}\n')
-        hand = wait_for_arm(listener, config, config.env)
+        hand = wait_for_arm(listener, config)
         assert isinstance(hand, LiveHand) and hand.gripper == 0.2
         assert hand_expert(config.env, listener).env is config.env
 
@@ -173,7 +173,7 @@ def test_points_in_another_unit_are_said_and_not_taken(sends, capsys, monkeypatc
             return sample
 
         monkeypatch.setattr(listener, "take", stop_after_three)
-        assert wait_for_arm(listener, config, config.env) is None
+        assert wait_for_arm(listener, config) is None
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "points: expected metres, got arms 530, 530 long, as an adult's in mm" in error
 

@@ -69,7 +69,7 @@ def test_drawings_contain_their_numbers():
 
 def test_the_chart_is_flat_while_the_arms_rest(monkeypatch):
     from mimic.commands import view_server
-    from mimic.viewer.history import History
+    from mimic.viewer.live_page import History
     from mimic.viewer.live_session import Frame
 
     now = iter([0.0, 1.0, 1.03, 9.0, 9.03])
