@@ -18,7 +18,7 @@ from collections.abc import Callable
 import numpy as np
 
 import mimic
-from mimic.base.config import new_folder
+from mimic.base.config import new_path
 from mimic.base.distribution import import_extra
 from mimic.motions.formats.episodes import EXTRA
 from mimic.motions.mocap.point_socket import PointListener
@@ -70,7 +70,7 @@ def main() -> None:
     recorder, state = None, ""
     try:
         if options.record:
-            new_folder("record", options.record)
+            new_path("record", options.record)
             import_extra("pyarrow", EXTRA, "record")
         operator = follow_hand(options.arm, options.rate, options.velocity)
         if options.record:

@@ -220,10 +220,8 @@ def _free_joints(
 
 
 def _moved(link: Link, rotation: np.ndarray, offset: np.ndarray, joint: int) -> Link:
-    def move(point: np.ndarray) -> np.ndarray:
-        return rotation @ point + offset
-
-    return dataclasses.replace(link, start=move(link.start), end=move(link.end), joint=joint)
+    start, end = (rotation @ point + offset for point in (link.start, link.end))
+    return dataclasses.replace(link, start=start, end=end, joint=joint)
 
 
 def _moved_hand(hand: Hand, rotation: np.ndarray, offset: np.ndarray, joint: int) -> Hand:

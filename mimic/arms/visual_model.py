@@ -45,7 +45,8 @@ def visual_spec(
     if config.is_file:
         _remove_scene(spec, model, chain_ids)
     if not any(bool(body.geoms) for body in spec.bodies[1:]):
-        _draw_links(model, data_at_zero(model), spec, chain_ids)
+        for joints in chain_ids.chains:
+            _draw_links(model, data_at_zero(model), spec, joints)
     if colours:
         links = body_links(model, config, limits)
         by_body = {model.body(body).name: colours[link] for body, link in links.items() if link in colours}
@@ -117,13 +118,8 @@ def _remove_scene(spec: mujoco.MjSpec, model: mujoco.MjModel, chain_ids: ChainId
                 geom.material, geom.rgba = "", [0, 0, 0, 0]
 
 
-def _draw_links(model: mujoco.MjModel, data: mujoco.MjData, spec: mujoco.MjSpec, chain_ids: ChainIds) -> None:
-    """Capsules from each joint to the next, for models without any geom."""
-    for joints in chain_ids.chains:
-        _draw_chain(model, data, spec, joints)
-
-
-def _draw_chain(model: mujoco.MjModel, data: mujoco.MjData, spec: mujoco.MjSpec, joints: Sequence[int]) -> None:
+def _draw_links(model: mujoco.MjModel, data: mujoco.MjData, spec: mujoco.MjSpec, joints: Sequence[int]) -> None:
+    """Capsules from each joint of a chain to the next, for models without any geom."""
     points = [data.xanchor[joint] for joint in joints]
     distal = [body for body in range(model.nbody) if model.jnt_bodyid[joints[-1]] in ancestors(model, body)]
     points.append(

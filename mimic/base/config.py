@@ -177,25 +177,17 @@ def check_unused(config: Any, keys: Collection[str], reason: str, prefix: str = 
             raise ValueError(f"{prefix}{field.name}: expected none {reason}, got {value!r:.80}")
 
 
-def new_file(name: str, path: str) -> Path:
-    """Returns the path of a file that a command will write.
+def new_path(name: str, path: str, kind: str = "folder") -> Path:
+    """Returns the path of a file that a command will write, or of a folder that it will create.
 
     Args:
       name: the config key, for error messages.
       path: the key's value.
+      kind: "file" or "folder".
 
     Raises:
       ValueError: the path is empty, exists, or its folder does not exist.
     """
-    return _new_path(name, path, "file")
-
-
-def new_folder(name: str, path: str) -> Path:
-    """Returns the path of a folder that a command will create and write into; see `new_file`."""
-    return _new_path(name, path, "folder")
-
-
-def _new_path(name: str, path: str, kind: str) -> Path:
     if not path:
         raise ValueError(f"{name}: expected a {kind}, as in {name}={kind.upper()}")
     new = Path(path).expanduser()

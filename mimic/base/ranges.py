@@ -101,9 +101,9 @@ def number(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def seed_number(default: int = 0) -> Any:
+def seed_number() -> Any:
     """A dataclass field for a random seed, a 64-bit integer."""
-    return number(default, at_least=-(2**63), at_most=2**63 - 1)
+    return number(0, at_least=-(2**63), at_most=2**63 - 1)
 
 
 def weight_number(default: float) -> Any:

@@ -87,11 +87,6 @@ def names(kind: str) -> tuple[str, ...]:
     return tuple(sorted(_registered[kind]))
 
 
-def is_registered(kind: str, name: str) -> bool:
-    """Whether `find` would return a thing."""
-    return name in names(kind)
-
-
 def find(kind: str, name: str, key: str) -> Any:
     """The thing with a registered name.
 
@@ -109,7 +104,7 @@ def find(kind: str, name: str, key: str) -> Any:
 
 def check(kind: str, name: str, key: str) -> None:
     """Raises a ValueError that lists the valid names unless a name is built in or registered."""
-    if name in _built_in[kind] or is_registered(kind, name):
+    if name in _built_in[kind] or name in names(kind):
         return
     known = ", ".join((*_built_in[kind], *names(kind))) or "none"
     raise ValueError(

@@ -14,7 +14,7 @@ from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.base.overrides import setting, shell_words
 from mimic.commands.config import CaptureConfig, RecordingConfig
 from mimic.commands.demonstrations_plot import plot_demonstrations
-from mimic.commands.printed import train_command
+from mimic.commands.printed import say, train_command
 from mimic.envs.config import DemonstrationConfig, EnvConfig, RewardConfig
 from mimic.metric.kinematics import link_state_table
 from mimic.motions.mocap.arms import find_arms, find_facing, unnamed
@@ -162,14 +162,12 @@ def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Pa
         length = env.horizon * env.control_dt / slow_down
         title = f"{source.name}, {parts[0].name}: {len(cut.start)} windows of {length:.2f} s"
         plot_demonstrations(cut.demonstrations, load_mjcf(model, tip=[ALL_ENDS]), plot, title=title)
-        for line in [*body_lines(capture.body), *_capture_lines(capture, cut, env)]:
-            console.print(line, soft_wrap=True, highlight=False, markup=False)
-        console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
-        console.print(f"results: {out}, {model}", soft_wrap=True, highlight=False)
+        say(console, *body_lines(capture.body), *_capture_lines(capture, cut, env))
+        say(console, f"plot: {plot}", f"results: {out}, {model}")
         expert = ArmConfig(model=str(model), tip=[ALL_ENDS] if config.arm == BOTH else None)
         demonstrations = DemonstrationConfig(path=str(out), count=cut.training, held_out=cut.held_out)
         command = train_command(training_env(env, expert, demonstrations))
-        console.print(f"train on it: {command}", soft_wrap=True, highlight=False, markup=False)
+        say(console, f"train on it: {command}")
 
     return run
 
@@ -196,14 +194,13 @@ def prepare_capture_inspection(source: Path, config: CaptureConfig) -> Callable[
 
     def run() -> None:
         console = Console()
-        for line in body_lines(body):
-            console.print(line, soft_wrap=True, highlight=False, markup=False)
+        say(console, *body_lines(body))
         both = [f"{BOTH} env=bimanual"] if len(find_arms(body)) == len(SIDES) else []
         for side in [*find_arms(body), *both]:
             out_file = f"{source.stem}_{side.split()[0]}.npz"
             words = [setting("source", str(source)), *(f"arm={side}".split()), setting("out", out_file)]
             command = f"python -m mimic.demonstrations {shell_words([*words, *_changed(config)])}"
-            console.print(f"demonstrations: {command}", soft_wrap=True, highlight=False, markup=False)
+            say(console, f"demonstrations: {command}")
 
     return run
 

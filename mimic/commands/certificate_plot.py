@@ -3,13 +3,10 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-
-from mimic.retargeting.certificate import POSITION, ROTATION, Certificate  # noqa: E402
+from mimic.retargeting.certificate import POSITION, ROTATION, Certificate
 
 _COLOURS = {True: "tab:blue", False: "tab:red"}  # of episodes that are ok and of those that fail
 
@@ -29,7 +26,8 @@ def plot_certificates(certificates: Mapping[str, Certificate], dt: float, out: P
         ("margin to the joint ranges [deg]", lambda item: np.degrees(item.margin), 0.0, False),
         ("fraction of the velocity limits", lambda item: item.speed, 1.0, False),
     )
-    figure, axes = plt.subplots(2, 2, figsize=(10, 6), sharex=True, layout="constrained")
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True)
     for axis, (label, values, bound, is_logarithmic) in zip(axes.ravel(), panels, strict=True):
         for is_ok, colour in _COLOURS.items():
             own = [np.append(values(item), np.nan) for item in certificates.values() if item.is_ok == is_ok]
@@ -47,4 +45,3 @@ def plot_certificates(certificates: Mapping[str, Certificate], dt: float, out: P
     fails = sum(not item.is_ok for item in certificates.values())
     figure.suptitle(f"{title}: {len(certificates)} episodes, {fails} fail (red)")
     figure.savefig(out, dpi=120)
-    plt.close(figure)

@@ -8,10 +8,11 @@ from typing import Any
 from rich.console import Console
 
 from mimic.base.compilation import use_compilation_cache
-from mimic.base.config import check_unused, new_folder
+from mimic.base.config import check_unused, new_path
 from mimic.base.distribution import NAME, VERSION, import_extra
 from mimic.commands.config import DatasetConfig
 from mimic.commands.dataset_sources import file_episodes, rollout_episodes
+from mimic.commands.printed import say
 from mimic.evaluation.labels import SPLITS
 from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.episodes import EXTRA, Episodes
@@ -34,7 +35,7 @@ def prepare_dataset(config: DatasetConfig) -> Callable[[], int]:
     """
     use_compilation_cache(config.compilation_cache)
     _check_keys(config)
-    out = new_folder("out", config.out)
+    out = new_path("out", config.out)
     import_extra(_PACKAGES[config.format], EXTRA, f"format={config.format}")
     compute = _prepare_rollouts(config) if config.run else _prepare_files(config)
 
@@ -45,9 +46,7 @@ def prepare_dataset(config: DatasetConfig) -> Callable[[], int]:
             print("error: no episode to write: each rollout of this policy is a runaway", file=sys.stderr)
             return 1
         _write(config.format, out, episodes, console)
-        for line in [*_lines(config.format, episodes), *notes]:
-            console.print(line, soft_wrap=True, highlight=False, markup=False)
-        console.print(f"results: {out}", soft_wrap=True, highlight=False)
+        say(console, *_lines(config.format, episodes), *notes, f"results: {out}")
         return 0
 
     return run

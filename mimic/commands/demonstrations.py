@@ -13,10 +13,11 @@ from rich.table import Table
 from mimic.arms.arm import Arm, build_arm, errors_of
 from mimic.arms.capsules import fit_capsules
 from mimic.arms.embodiment import Embodiment
-from mimic.base.config import check_unused, new_file
+from mimic.base.config import check_unused, new_path
 from mimic.commands.capture import MOTION_CAPTURE, prepare_capture
 from mimic.commands.config import RecordingConfig
 from mimic.commands.demonstrations_plot import plot_demonstrations
+from mimic.commands.printed import say
 from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import recorded_demonstrations
 from mimic.motions.demonstrations import Demonstrations, check_effort
@@ -58,11 +59,8 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
         title = f"{arm.embodiment.name}, {recording.kind} demonstrations: {recording.count}, seed {recording.seed}"
         plot_demonstrations(demonstrations, arm.embodiment, plot, title=title)
         console.print(_table(demonstrations, arm.embodiment))
-        console.print(_limits_line(arm.embodiment), soft_wrap=True, highlight=False)
-        _print_clearance(console, env, arm, demonstrations)
-        console.print(f"goals redrawn because a limit was exceeded: {redrawn}", highlight=False)
-        console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
-        console.print(f"results: {out}", soft_wrap=True, highlight=False)
+        say(console, _limits_line(arm.embodiment), *_clearance_lines(env, arm, demonstrations))
+        say(console, f"goals redrawn because a limit was exceeded: {redrawn}", f"plot: {plot}", f"results: {out}")
 
     return run
 
@@ -98,11 +96,8 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
         plot_demonstrations(imported, arm.embodiment, plot, title=f"{arm.embodiment.name}, {source.name}")
         console.print(_table(imported, arm.embodiment))
         length = f"{imported.horizon} steps of {imported.dt:g} s"
-        for line in [f"{source.name}: {imported.count} demonstrations, {length}", *notes, *_gripper_lines(imported)]:
-            console.print(line, soft_wrap=True, highlight=False, markup=False)
-        _print_clearance(console, env, arm, imported)
-        console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
-        console.print(f"results: {out}", soft_wrap=True, highlight=False)
+        say(console, f"{source.name}: {imported.count} demonstrations, {length}", *notes, _gripper_line(imported))
+        say(console, *_clearance_lines(env, arm, imported), f"plot: {plot}", f"results: {out}")
 
     return run
 
@@ -115,35 +110,35 @@ def _has_person(source: Path) -> bool:
         return False
 
 
-def _gripper_lines(demonstrations: Demonstrations) -> list[str]:
+def _gripper_line(demonstrations: Demonstrations) -> str:
     """A line about the gripper, in the units of its source."""
     if demonstrations.gripper is None:
-        return ["gripper: none"]
+        return "gripper: none"
     channels = np.moveaxis(demonstrations.gripper, -1, 0)
     ranges = [
         f"{name} from {values.min():.4g} to {values.max():.4g}"
         for name, values in zip(demonstrations.gripper_names, channels, strict=True)
     ]
-    return [f"gripper, as in the source: {', '.join(ranges)}"]
+    return f"gripper, as in the source: {', '.join(ranges)}"
 
 
-def _print_clearance(console: Console, env: EnvConfig, arm: Arm, demonstrations: Demonstrations) -> None:
-    """Prints which demonstrations have links that touch; nothing for an arm without shapes."""
+def _clearance_lines(env: EnvConfig, arm: Arm, demonstrations: Demonstrations) -> list[str]:
+    """A line about which demonstrations have links that touch; none for an arm without shapes."""
     try:
         capsules = fit_capsules(env.expert, env.limits)
     except ValueError:  # no geoms
-        return
+        return []
     floor_height = env.world.floor_height if env.world else 0.0
     clearances = smallest_clearances(arm.embodiment, capsules, demonstrations.qpos, floor_height)
-    console.print(touching_line(clearances), soft_wrap=True, highlight=False)
+    return [touching_line(clearances)]
 
 
 def _files(config: RecordingConfig) -> tuple[Path, Path]:
     """The new files of the demonstrations and, beside it, of their plot."""
-    out = new_file("out", config.out)
+    out = new_path("out", config.out, "file")
     if out.suffix != ".npz":
         raise ValueError(f"out: expected a file that ends in .npz, got {str(out)!r}")
-    return out, new_file("out", str(out.with_suffix(".png")))
+    return out, new_path("out", str(out.with_suffix(".png")), "file")
 
 
 def _record(arm: Arm, env: EnvConfig, console: Console) -> tuple[Demonstrations, int]:

@@ -3,16 +3,13 @@
 from pathlib import Path
 from typing import Any
 
-import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from jaxtyping import Float  # noqa: E402
-from matplotlib.collections import LineCollection  # noqa: E402
-
-from mimic.arms.embodiment import Embodiment  # noqa: E402
-from mimic.motions.demonstrations import Demonstrations  # noqa: E402
+from mimic.arms.embodiment import Embodiment
+from mimic.motions.demonstrations import Demonstrations
 
 _COLOURS = {"angle": "tab:blue", "gripper": "tab:brown", "velocity": "tab:green", "torque": "tab:purple"}
 _WIDTH, _HEIGHT = 1.7, 2.2  # inches of a panel
@@ -34,9 +31,8 @@ def plot_demonstrations(demonstrations: Demonstrations, arm: Embodiment, out: Pa
     if demonstrations.torque is not None:
         rows.append(("torque [N m]", demonstrations.torque, torque))
     size = _WIDTH * arm.num_joints + 0.6, _HEIGHT * len(rows) + 0.6
-    figure, panels = plt.subplots(
-        len(rows), arm.num_joints, figsize=size, sharex=True, sharey="row", squeeze=False, layout="constrained"
-    )
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(len(rows), arm.num_joints, sharex=True, sharey="row", squeeze=False)
     time = demonstrations.dt * np.arange(demonstrations.horizon + 1)
     for (label, values, limits), row in zip(rows, panels, strict=True):
         row[0].set_ylabel(label)
@@ -58,7 +54,6 @@ def plot_demonstrations(demonstrations: Demonstrations, arm: Embodiment, out: Pa
         axes.set_xlabel("time [s]")
     figure.suptitle(f"{title} (limits dashed)")
     figure.savefig(out, dpi=150)
-    plt.close(figure)
 
 
 def _draw(axes: Any, time: np.ndarray, values: Float[np.ndarray, "demonstrations time"], colour: str) -> None:

@@ -8,9 +8,10 @@ from typing import Any
 from rich.console import Console
 
 from mimic.base.compilation import use_compilation_cache
-from mimic.base.config import new_folder
+from mimic.base.config import new_path
 from mimic.base.distribution import import_extra
 from mimic.commands.config import CONTROLLERS, EvaluateConfig
+from mimic.commands.printed import say
 from mimic.envs.config import EnvConfig
 from mimic.envs.family import with_one_learner
 from mimic.motions.demonstrations import Demonstrations, load_demonstrations
@@ -63,7 +64,7 @@ def prepare_report(config: EvaluateConfig, started: float, console: Console) -> 
     stopwatch = Stopwatch(started)
     use_compilation_cache(config.compilation_cache)
     run_dir, trained = given_run(config.run)
-    out = new_folder("out", config.out) if config.out else None
+    out = new_path("out", config.out) if config.out else None
     with stopwatch.stage("build"):
         trained, trainer = _trainer_to_evaluate(trained, run_dir, config)
         steps, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
@@ -82,7 +83,7 @@ def prepare_report(config: EvaluateConfig, started: float, console: Console) -> 
             save_config(out, trained)  # what the report is of, for `mimic.collect`
             trainer.save_outcome(out, outcome, config.controller)
             write_report(out, report)
-            console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
+            say(console, f"results: {config.out}")
         return report
 
     return run

@@ -13,8 +13,9 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from mimic.base.config import new_folder
+from mimic.base.config import new_path
 from mimic.commands.config import EvaluateConfig
+from mimic.commands.printed import say
 from mimic.deploy.bundle import MOTIONS
 from mimic.deploy.safety import COLLISION, LATE, check_supported
 from mimic.envs import env_config
@@ -50,7 +51,7 @@ def prepare_robot_evaluation(
     """
     _check(config, trained)
     assert isinstance(trainer, PPOTrainer)
-    out = new_folder("out", config.out) if config.out else None
+    out = new_path("out", config.out) if config.out else None
     steps = check_checkpoint(run_dir, config.checkpoint)
     own = cast(WorldConfig, trained.env.world)
     world = cast(WorldConfig, env_config("panda7dof", world=config.robot_world).world) if config.robot_world else own
@@ -85,7 +86,7 @@ def prepare_robot_evaluation(
         if out:
             out.mkdir()
             write_report(out, report)
-            console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
+            say(console, f"results: {config.out}")
 
     return run
 

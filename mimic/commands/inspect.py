@@ -6,35 +6,32 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from matplotlib.axes import Axes  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.markup import escape  # noqa: E402
-from rich.table import Table  # noqa: E402
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from mimic.arms.arm import Arm, ArmConfig, finite_velocity_limit, torque_scale, with_full_keys
-from mimic.arms.rendering import ArmScene  # noqa: E402
-from mimic.arms.simulation_model import effective_inertia  # noqa: E402
-from mimic.base.config import new_folder  # noqa: E402
-from mimic.commands import arm_checks  # noqa: E402
-from mimic.commands.config import InspectConfig, base_numbers  # noqa: E402
-from mimic.commands.hand_reach import (  # noqa: E402
+from mimic.arms.rendering import ArmScene
+from mimic.arms.simulation_model import effective_inertia
+from mimic.base.config import new_path
+from mimic.commands import arm_checks
+from mimic.commands.config import InspectConfig, base_numbers
+from mimic.commands.hand_reach import (
     HandReach,
     hand_reach,
     plot_reach,
     reach_lines,
     reach_table,
 )
-from mimic.commands.printed import train_command  # noqa: E402
-from mimic.envs.config import EnvConfig  # noqa: E402
-from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402
-from mimic.motions.demonstrations import Demonstrations  # noqa: E402
-from mimic.runs.files import finite  # noqa: E402
-from mimic.trainers.progress import similarity_table  # noqa: E402
+from mimic.commands.printed import say, train_command
+from mimic.envs.config import EnvConfig
+from mimic.evaluation.rollout_metrics import pose_similarity
+from mimic.motions.demonstrations import Demonstrations
+from mimic.runs.files import finite
+from mimic.trainers.progress import similarity_table
 
 _PICTURE, _RESULTS = "arms.png", "inspection.json"
 _SCENE = 800, 640  # pixels
@@ -75,7 +72,7 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
       ValueError: an arm cannot be trained, the expert's limits permit no goal, `out` exists, or OpenGL is not available
         for the pictures.
     """
-    out = new_folder("out", config.out) if config.out else None
+    out = new_path("out", config.out) if config.out else None
     env = EnvConfig(name="pair", expert=config.expert, learner=config.learner, limits=config.limits)
     expert, learner = env.build_arms()
     demonstrations = arm_checks.sample_demonstrations(expert, env) if config.bound else None
@@ -95,8 +92,8 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
                 image = scene.image(home)
             _save_picture(out / _PICTURE, image, expert, learner, env, inspection.reach)
             _write(out / _RESULTS, inspection, expert, learner)
-            console.print(f"results: {out}", soft_wrap=True, highlight=False)
-        console.print(f"train it: {inspection.command}", soft_wrap=True, highlight=False, markup=False)
+            say(console, f"results: {out}")
+        say(console, f"train it: {inspection.command}")
 
     return run
 
@@ -133,7 +130,7 @@ def _inspect(
 
 
 def _print(console: Console, inspection: Inspection, expert: Arm, learner: Arm, *, is_searched: bool) -> None:
-    console.print(_headline(expert, learner), highlight=False, soft_wrap=True)
+    say(console, _headline(expert, learner))
     console.print(_table(f"joints of {learner.embodiment.name}", inspection.joints))
     console.print(_table("links, and the expert links that they are compared with", inspection.links))
     notes = {
@@ -143,16 +140,14 @@ def _print(console: Console, inspection: Inspection, expert: Arm, learner: Arm, 
         "warning": inspection.warnings,
     }
     for label, lines in notes.items():
-        for line in lines:
-            console.print(f"{label}: {escape(line)}", highlight=False, soft_wrap=True)
+        say(console, *(f"{label}: {line}" for line in lines))
     if inspection.reachable is not None and inspection.similarity is not None:
-        console.print(_distance_line(inspection.reachable, expert), highlight=False, soft_wrap=True)
+        say(console, _distance_line(inspection.reachable, expert))
         console.print(similarity_table(inspection.similarity))
     if inspection.reach is not None:
         pair = expert.embodiment, learner.embodiment
         console.print(reach_table(inspection.reach, pair))
-        for line in reach_lines(inspection.reach, pair, is_searched=is_searched):
-            console.print(line, highlight=False, soft_wrap=True, markup=False)
+        say(console, *reach_lines(inspection.reach, pair, is_searched=is_searched))
 
 
 def _write(path: Path, inspection: Inspection, expert: Arm, learner: Arm) -> None:
@@ -261,14 +256,12 @@ def _save_picture(
 ) -> None:
     """Draws both arms in their start poses, the correspondence of their links, and what the hand keeps, if known."""
     rows = 1 if reach is None else 2
-    figure, axes = plt.subplots(
-        rows, 2, figsize=(13, 5.6 * rows), width_ratios=(1.35, 1), layout="constrained", squeeze=False
-    )
+    figure = Figure(figsize=(13, 5.6 * rows), layout="constrained")
+    axes = figure.subplots(rows, 2, width_ratios=(1.35, 1), squeeze=False)
     _draw_links(axes[0, 0], axes[0, 1], image, expert, learner, env)
     if reach is not None:
         plot_reach((axes[1, 0], axes[1, 1]), reach, (expert.embodiment, learner.embodiment))
     figure.savefig(path, dpi=100)
-    plt.close(figure)
 
 
 def _draw_links(left: Axes, right: Axes, image: np.ndarray, expert: Arm, learner: Arm, env: EnvConfig) -> None:

@@ -1,8 +1,10 @@
-"""Commands that a command prints: complete, and quoted for a shell."""
+"""Lines that a command prints, and in them commands: complete, and quoted for a shell."""
 
 import os
 from collections.abc import Mapping
 from typing import Any
+
+from rich.console import Console
 
 from mimic.arms.named_arms import is_arm_name, named_arms
 from mimic.base.config import to_dict
@@ -12,6 +14,12 @@ from mimic.envs import env_config, environments
 from mimic.envs.config import EnvConfig
 
 _WORLDS = (None, "ideal", "nominal", "hardware", "unknown")
+
+
+def say(console: Console, *lines: str) -> None:
+    """Prints lines as they are: not wrapped, without markup and colours."""
+    for line in lines:
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def train_command(env: EnvConfig) -> str:

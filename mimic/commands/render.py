@@ -7,25 +7,23 @@ from pathlib import Path
 from typing import Any
 
 import imageio_ffmpeg
-import matplotlib
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from rich.console import Console
+from rich.progress import track
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from jaxtyping import Float, UInt8  # noqa: E402
-from matplotlib.figure import Figure  # noqa: E402
-from matplotlib.text import Text  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.progress import track  # noqa: E402
-
-from mimic.arms.link_match import Capsule  # noqa: E402
-from mimic.arms.rendering import ArmScene  # noqa: E402
-from mimic.base.compilation import use_compilation_cache  # noqa: E402
-from mimic.base.config import check_new  # noqa: E402
-from mimic.commands.clips import FRAMES_PER_SECOND, Clip, prepare_clip  # noqa: E402
-from mimic.commands.config import RenderConfig  # noqa: E402
-from mimic.evaluation.labels import similarity_texts  # noqa: E402
-from mimic.retargeting.hand_target import placed_hands, placement  # noqa: E402
+from mimic.arms.link_match import Capsule
+from mimic.arms.rendering import ArmScene
+from mimic.base.compilation import use_compilation_cache
+from mimic.base.config import check_new
+from mimic.commands.clips import FRAMES_PER_SECOND, Clip, prepare_clip
+from mimic.commands.config import RenderConfig
+from mimic.commands.printed import say
+from mimic.evaluation.labels import similarity_texts
+from mimic.retargeting.hand_target import placed_hands, placement
 
 _SIZE, _DPI = (1280, 640), 100  # pixels
 _SCENE = 760, 548  # pixels of the arms' picture
@@ -62,7 +60,7 @@ def prepare_video(config: RenderConfig) -> Callable[[], None]:
         with scene:
             frames = draw_frames(scene, clip)
             _write_video(out, track(frames, "rendering", len(clip.time), console=console, transient=True))
-        console.print(f"results: {out}", soft_wrap=True, highlight=False)
+        say(console, f"results: {out}")
 
     return run
 
@@ -85,7 +83,7 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
 
     The static artists are drawn once and blitted: drawing all of them for each frame costs as much as rendering.
     """
-    figure = plt.figure(figsize=(_SIZE[0] / _DPI, _SIZE[1] / _DPI), dpi=_DPI)
+    figure = Figure(figsize=(_SIZE[0] / _DPI, _SIZE[1] / _DPI), dpi=_DPI)
     scene_width = _SCENE[0] / _SIZE[0]  # fraction of the frame that shows the arms
     scene.fit(clip.poses, [objects[..., :3, 3].reshape(-1, 3) for objects in _objects(clip)])
     left, width = scene_width + 0.07, 1 - scene_width - 0.09
@@ -97,7 +95,7 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
     animated = [picture, now, *similarity.values(), *bars]
     for artist in animated:
         artist.set_animated(True)
-    canvas: Any = figure.canvas
+    canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
     background = canvas.copy_from_bbox(figure.bbox)
     for frame, time in enumerate(clip.time):
@@ -112,7 +110,6 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
         for artist in animated:
             figure.draw_artist(artist)
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
-    plt.close(figure)
 
 
 def _image(scene: ArmScene, clip: Clip, frame: int) -> UInt8[np.ndarray, "height width 3"]:

@@ -20,9 +20,10 @@ from mimic.arms.embodiment import Embodiment
 from mimic.arms.gripper import GripperRange, gripper_range
 from mimic.base import compat
 from mimic.base.compilation import use_compilation_cache
-from mimic.base.config import new_folder
+from mimic.base.config import new_path
 from mimic.commands.certificate_plot import plot_certificates
 from mimic.commands.config import RetargetConfig, base_numbers
+from mimic.commands.printed import say
 from mimic.commands.retargeted_motions import MOTIONS, save_motions
 from mimic.metric.config import MetricConfig
 from mimic.motions.formats.episodes import Motion
@@ -76,7 +77,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], int]:
         raise ValueError("costs: expected no velocity or acceleration with an exact or near hand; hand=scaled has them")
     if config.hand == "scaled" and config.base == "auto":
         raise ValueError("base: expected no auto with hand=scaled, which compares each arm from its own base")
-    out, env = new_folder("out", config.out), config.resolve()
+    out, env = new_path("out", config.out), config.resolve()
     expert, learner = env.build_arms().embodiments
     free = build_arm(dataclasses.replace(env.expert, home=None), config.limits or "none").embodiment
     for arm in (expert, learner) if config.hand != "scaled" else ():
@@ -100,7 +101,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], int]:
 
     def run() -> int:
         console = Console()
-        _print_lines(console, [note for note in data.notes if note.startswith(_WARNING)])
+        say(console, *(note for note in data.notes if note.startswith(_WARNING)))
         used = _with_base(setting, config.base, data, console)
         motions: dict[str, dict[str, Motion]] = {entry: {} for entry in data.motions}
         certificates = {}
@@ -124,7 +125,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], int]:
             save_motions(folder, (expert, learner), data.measured, motions[data.entry], base)
             plot_certificates(certificates, dt, folder / _PICTURE, f"{expert.name} to {learner.name}, {data.path.name}")
         _print(console, data, certificates, kept, used, lines)
-        console.print(f"results: {out}", soft_wrap=True, highlight=False)
+        say(console, f"results: {out}")
         return 0
 
     return run
@@ -293,17 +294,12 @@ def _print(
     lines += [note for note in data.notes if not note.startswith(_WARNING)]
     lines += [f"commands: {', '.join(data.commands) or 'none'}"]
     lines.append(_gripper_line(data, setting))
-    _print_lines(console, [*lines, *written, *filter(None, [_help_line(certificates, setting)])])
+    say(console, *lines, *written, *filter(None, [_help_line(certificates, setting)]))
 
 
 def _number(value: float, digits: int) -> str:
     """A cell of the table; what is not known, as of an arm without a hand or without shapes, is a dash."""
     return "-" if np.isnan(value) else f"{round(value, digits) + 0.0:.{digits}f}"  # 0.0 and not -0.0
-
-
-def _print_lines(console: Console, lines: Sequence[str]) -> None:
-    for line in lines:
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def _gripper_line(data: DataSet, setting: _Setting) -> str:

@@ -5,17 +5,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
+import matplotlib.ticker
+import numpy as np
+from matplotlib.figure import Figure
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import matplotlib.ticker  # noqa: E402
-import numpy as np  # noqa: E402
-
-from mimic.base.files import read_text  # noqa: E402
-from mimic.evaluation.labels import SIMILARITY_HEADERS, SIMILARITY_NAMES, SPLIT_NAMES  # noqa: E402
-from mimic.evaluation.rollout_metrics import WORST  # noqa: E402
-from mimic.runs.files import METRICS  # noqa: E402
+from mimic.base.files import read_text
+from mimic.evaluation.labels import SIMILARITY_HEADERS, SIMILARITY_NAMES, SPLIT_NAMES
+from mimic.evaluation.rollout_metrics import WORST
+from mimic.runs.files import METRICS
 
 if TYPE_CHECKING:
     from mimic.evaluation.evaluator import Evaluator, Rollouts
@@ -31,7 +28,8 @@ def plot_training(folder: Path, metric: str, label: str, *, labels: Mapping[str,
         return
     rows = list(csv.DictReader(read_text(log).splitlines()))
     steps = [int(row["step"]) for row in rows]
-    figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
+    figure = Figure(figsize=(6, 3.6), layout="constrained")
+    axes = figure.subplots()
     for split, colour in _COLOURS.items():
         column = f"quality/{metric}.{split}"
         if column not in rows[0]:  # many arms, none of which is in this split
@@ -43,7 +41,7 @@ def plot_training(folder: Path, metric: str, label: str, *, labels: Mapping[str,
     axes.yaxis.set_minor_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     axes.grid(alpha=0.3, which="both")
     axes.legend()
-    _save(figure, folder / "training.png")
+    figure.savefig(folder / "training.png", dpi=150)
 
 
 def labels_of(data: str) -> dict[str, str]:
@@ -54,7 +52,8 @@ def labels_of(data: str) -> dict[str, str]:
 def plot_quality(evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, controller: str, title: str) -> None:
     """Plots the mean distance over the time of an episode, with the kinematic bound and holding the start pose."""
     time = evaluator.env.config.control_dt * np.arange(1, evaluator.env.config.horizon + 1)
-    figure, all_axes = plt.subplots(1, 2, figsize=(9, 4), sharey=True, layout="constrained")
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    all_axes = figure.subplots(1, 2, sharey=True)
     for axes, (split, part) in zip(all_axes, evaluator.parts.items(), strict=True):
         distance = np.asarray(rollouts.distance)[part]
         low, high = np.quantile(distance, [0.1, 0.9], axis=0)
@@ -75,9 +74,8 @@ def plot_demonstrations(
     table, parts = evaluator.table(rollouts), evaluator.parts
     counts = [len(table["optimality_gap"][part]) for part in parts.values()]
     widths = [max(count, max(counts) / 3) for count in counts]
-    figure, rows = plt.subplots(
-        2, 2, figsize=(9, 6), sharex="col", sharey="row", layout="constrained", width_ratios=widths
-    )
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    rows = figure.subplots(2, 2, sharex="col", sharey="row", width_ratios=widths)
     for (above, below), count, (split, part) in zip(rows.T, counts, parts.items(), strict=True):
         order = np.argsort(-table["optimality_gap"][part])
         place = np.arange(1, count + 1)
@@ -105,9 +103,8 @@ def plot_demonstrations(
 def plot_similarity(similarity: Mapping[str, Mapping[str, Mapping[str, float]]], out: Path, *, title: str) -> None:
     """Plots bars of each measure of similarity, for the controller and each baseline, by split."""
     names = list(similarity)
-    figure, all_axes = plt.subplots(
-        1, len(SIMILARITY_HEADERS), figsize=(12, 0.42 * len(names) + 1.6), sharey=True, layout="constrained"
-    )
+    figure = Figure(figsize=(12, 0.42 * len(names) + 1.6), layout="constrained")
+    all_axes = figure.subplots(1, len(SIMILARITY_HEADERS), sharey=True)
     place = np.arange(len(names))
     for axes, (key, header) in zip(all_axes, SIMILARITY_HEADERS.items(), strict=True):
         for offset, (split, colour) in zip((-0.2, 0.2), _COLOURS.items(), strict=True):
@@ -131,9 +128,4 @@ def _finish(figure: Any, labelled: Any, title: str, out: Path) -> None:
     figure.suptitle(title)
     handles, labels = labelled.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize="small")
-    _save(figure, out)
-
-
-def _save(figure: Any, out: Path) -> None:
     figure.savefig(out, dpi=150)
-    plt.close(figure)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from mimic.arms.capsules import Capsules
 from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import continuous_joints
 from mimic.base import spatial
 from mimic.base.ranges import check_ranges, number
 from mimic.metric.capsule_distances import capsule_axes, intrusion, pair_distances
@@ -19,7 +20,6 @@ from mimic.retargeting.optimizers import Derivatives, Scalars
 from mimic.retargeting.pose_objective import PoseObjective, Target, automatic_derivatives
 
 _NEAR_LIMIT = 0.1  # fraction of a joint's range at each end where `limits` counts
-_FULL_TURN = 2 * np.pi - 1e-4  # rad; a joint with such a range has no limits, as for `continuous_joints`
 
 
 def _weight() -> float:
@@ -133,8 +133,7 @@ def home_cost(arm: Embodiment, qpos: Float[Array, " joints"]) -> Float[Array, ""
     """Mean squared distance from the home pose, in half ranges; periodic for joints of a full revolution."""
     lower, upper = np.asarray(arm.joint_range).T
     difference = qpos - np.asarray(arm.home)
-    is_periodic = upper - lower >= _FULL_TURN
-    square = jnp.where(is_periodic, 2 * (1 - jnp.cos(difference)), difference**2)
+    square = jnp.where(continuous_joints(arm), 2 * (1 - jnp.cos(difference)), difference**2)
     return jnp.mean(square / ((upper - lower) / 2) ** 2).astype(qpos.dtype)
 
 
@@ -143,7 +142,7 @@ def limit_cost(arm: Embodiment, qpos: Float[Array, " joints"]) -> Float[Array, "
     lower, upper = np.asarray(arm.joint_range).T
     margin = _NEAR_LIMIT * (upper - lower)
     intrusion = jnp.maximum(0, 1 - jnp.minimum(qpos - lower, upper - qpos) / margin)
-    return jnp.mean(jnp.where(upper - lower >= _FULL_TURN, 0, intrusion**2)).astype(qpos.dtype)
+    return jnp.mean(jnp.where(continuous_joints(arm), 0, intrusion**2)).astype(qpos.dtype)
 
 
 def with_costs(

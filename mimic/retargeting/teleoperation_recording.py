@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mimic.base.config import new_folder
+from mimic.base.config import new_path
 from mimic.base.distribution import NAME, VERSION
 from mimic.motions.formats.episodes import ANGLE, ArmMotions, Episodes
 from mimic.motions.formats.lerobot import frames_per_second, write_lerobot
@@ -85,7 +85,7 @@ class TeleoperationRecorder:
         """
         if not self._episodes:
             raise ValueError("TeleoperationRecorder: expected an episode, got no tick with the clutch engaged")
-        with written_atomically(new_folder("folder", str(folder))) as out:
+        with written_atomically(new_path("folder", str(folder))) as out:
             write_lerobot(out, self._data_set(task))
 
     def _data_set(self, task: str) -> Episodes:

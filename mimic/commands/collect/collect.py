@@ -26,6 +26,7 @@ from mimic.commands.collect.seed_groups import (
     group_runs,
 )
 from mimic.commands.config import CollectConfig
+from mimic.commands.printed import say
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import REPORT
 
@@ -83,7 +84,7 @@ def _collect(finished: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: 
         print(f"note: the runs are of several versions of mimic: {counts}", file=sys.stderr)
     for run in left_out:
         print(f"left out: {run.name}: {run.reason}", file=sys.stderr)
-    console.print(f"results: {out}/{NAME}.csv, .json, .png", soft_wrap=True, highlight=False)
+    say(console, f"results: {out}/{NAME}.csv, .json, .png")
     return SOME_LEFT_OUT if left_out else 0
 
 

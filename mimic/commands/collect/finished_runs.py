@@ -182,8 +182,7 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
 
 def _other_version(version: str) -> str:
     """The beginning of a reason, where the run is of another version of mimic than this one."""
-    this = VERSION
-    return f"of mimic {version}, and this is {this}: " if version != this else ""
+    return f"of mimic {version}, and this is {VERSION}: " if version != VERSION else ""
 
 
 def _evaluation_settings(
@@ -220,7 +219,7 @@ def _history(path: Path) -> dict[str, dict[int, float]]:
     """
     columns: dict[str, dict[int, float]] = {}
     if path.is_file():
-        header, *rows = list(csv.reader(_complete_lines(path))) or [[]]
+        header, *rows = list(csv.reader(read_text(path).split("\n")[:-1])) or [[]]
         for number, row in enumerate(rows, start=2):
             if len(row) != len(header):
                 raise ValueError(f"line {number} has {len(row)} cells, expected {len(header)}")
@@ -230,10 +229,6 @@ def _history(path: Path) -> dict[str, dict[int, float]]:
                 if value:
                     columns.setdefault(key, {})[step] = float(value)
     return columns
-
-
-def _complete_lines(path: Path) -> list[str]:
-    return read_text(path).split("\n")[:-1]
 
 
 def _numbers(report: Mapping[str, Any]) -> dict[str, float]:

@@ -6,16 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import matplotlib.ticker
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import matplotlib.ticker  # noqa: E402
-import numpy as np  # noqa: E402
-from matplotlib.lines import Line2D  # noqa: E402
-
-from mimic.commands.collect.finished_runs import QualityMetric  # noqa: E402
-from mimic.commands.collect.seed_groups import SeedGroup, mean_interval  # noqa: E402
-from mimic.evaluation.labels import SPLITS  # noqa: E402
+from mimic.commands.collect.finished_runs import QualityMetric
+from mimic.commands.collect.seed_groups import SeedGroup, mean_interval
+from mimic.evaluation.labels import SPLITS
 
 _LABELS = {"train": "training data", "held_out": "held-out data"}
 _MARKERS = {"train": "s", "held_out": "o"}
@@ -27,7 +25,8 @@ _TABLEAU = 10  # number of distinct colours; more groups use a colour map
 def plot_collected(groups: Sequence[SeedGroup], metric: QualityMetric, out: Path) -> None:
     """Plots held-out learning curves and the final metric of each group in percent, with confidence intervals."""
     height = max(4.0, 1.6 + 0.42 * len(groups))
-    figure, (curves, final) = plt.subplots(1, 2, figsize=(11, height), layout="constrained")
+    figure = Figure(figsize=(11, height), layout="constrained")
+    curves, final = figure.subplots(1, 2)
     colours = [_colour(number, len(groups)) for number in range(len(groups))]
     for group, colour in zip(groups, colours, strict=True):
         _draw_curves(curves, group, colour)
@@ -49,7 +48,6 @@ def plot_collected(groups: Sequence[SeedGroup], metric: QualityMetric, out: Path
     for axes in (curves, final):
         axes.grid(alpha=0.3, which="major")
     figure.savefig(out, dpi=150)
-    plt.close(figure)
 
 
 def _tick(group: SeedGroup) -> str:
@@ -61,7 +59,8 @@ def _fill(split: str, colour: Any) -> Any:
 
 
 def _colour(number: int, count: int) -> Any:
-    return plt.get_cmap("tab10")(number) if count <= _TABLEAU else plt.get_cmap("turbo")(number / (count - 1))
+    maps = matplotlib.colormaps
+    return maps["tab10"](number) if count <= _TABLEAU else maps["turbo"](number / (count - 1))
 
 
 def _draw_curves(axes: Any, group: SeedGroup, colour: Any) -> None:

@@ -67,7 +67,7 @@ def drop_repeated(runs: Sequence[FinishedRun]) -> tuple[list[FinishedRun], list[
     newest: dict[tuple[str, int], FinishedRun] = {}
     repeated = []
     for run in sorted(runs, key=lambda run: run.finished):
-        key = (_fingerprint(run), run.seed)
+        key = (_text(run.settings), run.seed)
         if key in newest:
             repeated.append(LeftOut(newest[key].name, f"{run.name} has the same settings and seed, and is newer"))
         newest[key] = run
@@ -79,7 +79,7 @@ def group_runs(runs: Sequence[FinishedRun]) -> list[SeedGroup]:
     """Groups runs by their settings, in the order of the first run of each group."""
     by_settings: dict[str, list[FinishedRun]] = defaultdict(list)
     for run in runs:
-        by_settings[_fingerprint(run)].append(run)
+        by_settings[_text(run.settings)].append(run)
     members = [sorted(group, key=lambda run: run.seed) for group in by_settings.values()]
     settings = [group[0].settings for group in members]
     keys = list(dict.fromkeys(key for group in settings for key in group))
@@ -117,10 +117,6 @@ def _label(run: FinishedRun, keys: Sequence[str]) -> str:
         if key in run.settings
     ]
     return " ".join(parts) or str(run.settings["env.name"])
-
-
-def _fingerprint(run: FinishedRun) -> str:
-    return _text(run.settings)
 
 
 def _text(value: Any) -> str:

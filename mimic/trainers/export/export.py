@@ -8,7 +8,7 @@ from typing import Literal
 
 from rich.console import Console
 
-from mimic.base.config import check_choice, new_file, new_folder
+from mimic.base.config import check_choice, new_path
 from mimic.base.distribution import import_extra
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.trainers.export.config import CONTROLLER, EXPORT_FORMATS, ExportConfig
@@ -75,10 +75,10 @@ def _writer(config: ExportConfig) -> tuple[Callable[[], None], str]:
     check_choice("format", config.format, EXPORT_FORMATS)
     if config.format == CONTROLLER:
         _check_packages(config.format)
-        out = new_folder("out", config.out)
+        out = new_path("out", config.out)
         write = prepare_controller(given_run(config.run)[0], config.checkpoint)
         return lambda: write(out), ""
-    out = new_file("out", config.out)
+    out = new_path("out", config.out, "file")
     if out.suffix != ".onnx":
         raise ValueError(f"out: expected a file that ends in .onnx, got {str(out)!r}")
     if not os.access(out.parent, os.W_OK):
