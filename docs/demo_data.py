@@ -18,7 +18,7 @@ FIRST = "panda4dof"  # the environment that the page shows first
 
 def scripts() -> dict[str, str]:
     """The scripts by name: a mapper of each environment, and "start", which starts the page."""
-    from mimic.trainers.pretrained.network import pretrained_names  # a second of imports, only where a site is built
+    from mimic.trainers.pretrained import pretrained_names
 
     names = sorted(pretrained_names("pose_mapper"), key=lambda name: (name != FIRST, name))
     start = f'mimicDemo.start(document.getElementById("mimic-demo"), {json.dumps(names)});\n'

@@ -26,6 +26,7 @@ from mimic.retargeting.certificate import hand_errors
 from mimic.retargeting.hand_target import placement, states_in_base
 from mimic.retargeting.pose import imitate_pose
 from mimic.runs.checkpoints import load_checkpoint
+from mimic.runs.parameters import has_network
 from mimic.trainers.make import make_policy_trainer
 from mimic.trainers.run_config import policy_run
 
@@ -125,7 +126,8 @@ def _policy_clip(config: RenderConfig) -> ClipPlan:
     name = f"{config.split}-{config.demonstration}.mp4"
     if config.learner:
         name = f"{trained.env.name}-{name}"
-    return ClipPlan(trained.env, run_dir / "videos" / name, compute)
+    out = Path(f"{trained.env.name}-{name}") if has_network(run_dir) else run_dir / "videos" / name
+    return ClipPlan(trained.env, out, compute)
 
 
 def _data_set_clip(config: RenderConfig) -> ClipPlan:

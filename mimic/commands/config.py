@@ -39,7 +39,7 @@ class EvaluateConfig:
     """Config of an evaluation of a trained policy, or of another controller in its place.
 
     Attributes:
-      run: run directory.
+      run: run directory, or the environment of a policy that comes with mimic.
       checkpoint: environment steps of the checkpoint. Default None: the last checkpoint.
       controller: "policy", or a baseline controller (see `run_controller`).
       learner: of a run of many arms: name or file of the one arm to evaluate on. Default "": all arms of the report.
@@ -110,7 +110,7 @@ class RenderConfig:
     """Config of a video of a trained policy, or of retargeted motions.
 
     Attributes:
-      run: run directory of a policy.
+      run: run directory of a policy, or the environment of one that comes with mimic.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
       split: "held_out" or "train": demonstrations of a policy's run.
       demonstration: index from 0 into the split, or of the episode of the data set.
@@ -119,7 +119,8 @@ class RenderConfig:
       learner: its learner, in the same way; of a run of many arms, name or file of the arm.
       locked: numbers or names of the joints of this arm that are locked; of a run of many arms.
       limits: the `limits` that `retargeted` was computed with.
-      out: video file. Default "": a file in the folder `videos` of the run directory.
+      out: video file. Default "": a file in the folder `videos` of the run directory, or in the
+        current folder where there is none.
       compilation_cache: see `TrainConfig`.
     """
 
@@ -146,7 +147,7 @@ class DatasetConfig:
     """Config of a dataset of rollouts of a policy, or of motions from files.
 
     Attributes:
-      run: run directory of a policy.
+      run: run directory of a policy, or the environment of one that comes with mimic.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
       split: "held_out" or "train": demonstrations of the run to roll the policy out on. Default "": both.
       demonstrations: file of motions to write instead of rollouts.
@@ -393,7 +394,7 @@ class ViewConfig:
       env: environment that defines the arms and the metric.
       mapper: pose mapper that moves the learner instead of the optimiser: a run directory, or the environment
         of one that comes with mimic. Its arms are used.
-      run: run directory of a policy to play. Its arms and demonstrations are used.
+      run: the same of a policy to play. Its arms and demonstrations are used.
       source: motion capture file of a person to play as the expert, or tcp://localhost:PORT, a socket of this machine
         that takes points as lines of JSON.
       demonstrations: file of the expert's demonstrations to choose from. Default "": random ones are recorded.

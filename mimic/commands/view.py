@@ -32,7 +32,7 @@ from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.episodes import EXTRA
 from mimic.motions.mocap.live_hand import LiveHand
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.run_config import check_run_dir, policy_run
+from mimic.trainers.run_config import given_run, policy_run
 from mimic.viewer.hand_following import HandSettings
 from mimic.viewer.live_session import RATE, LiveSession
 
@@ -151,21 +151,11 @@ def _load_mapper(config: ViewConfig) -> "PoseMapper":
     """The mapper in `mapper`: a run directory, or the name of one that comes with mimic.
 
     Raises:
-      ValueError: see `PoseMapper.load`.
+      ValueError: see `given_run` and `PoseMapper.load`.
     """
     from mimic.trainers.pose_mapper.mapper import PoseMapper
-    from mimic.trainers.pretrained.network import NETWORKS, pretrained_names, read_network
 
-    run_dir = Path(config.mapper).expanduser()
-    names = pretrained_names("pose_mapper")
-    if config.mapper not in names or run_dir.exists():
-        check_run_dir(run_dir, "mapper", f" or one of {', '.join(names)},")
-        return PoseMapper.load(run_dir, config.checkpoint)
-    if config.checkpoint is not None:
-        raise ValueError(f"checkpoint: expected none with mapper={config.mapper}, which comes with mimic")
-    mapper = read_network(NETWORKS / f"{config.mapper}-pose_mapper", "pose_mapper").function
-    assert isinstance(mapper, PoseMapper)
-    return mapper
+    return PoseMapper.load(given_run(config.mapper, "mapper", "pose_mapper")[0], config.checkpoint)
 
 
 def _prepare_captured(config: ViewConfig) -> Callable[[], int]:

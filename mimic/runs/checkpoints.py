@@ -20,7 +20,15 @@ import numpy as np
 
 from mimic.base.files import file_digest, read_json, read_text, write_atomically
 from mimic.base.npz import read_arrays
-from mimic.runs.parameters import OtherParameters, named_leaves, read_parameters, write_parameters
+from mimic.runs.files import read_report
+from mimic.runs.parameters import (
+    OtherParameters,
+    has_network,
+    named_leaves,
+    read_parameters,
+    read_params,
+    write_parameters,
+)
 
 FOLDER = "checkpoints"
 WITH_STATE = 2  # newest checkpoints of a run that have the state of the training
@@ -29,6 +37,7 @@ STATE_UNUSED = (
 )
 _PARAMS, _STATE, _CONTENT, _RUN = "params.npz", "training.npz", "checkpoint.json", "run_id"
 _PARTIAL, _DAMAGED = ".partial", ".damaged"
+_UNITS = "env_steps", "training_poses"  # of training steps, in a report
 _MAX_ARRAYS = 1000  # of a training's state; PPO has some 60
 
 T = TypeVar("T")
@@ -129,7 +138,10 @@ def mark_damaged_after(run_dir: Path, step: int) -> None:
 
 
 def checkpoint_steps(run_dir: Path) -> list[int]:
-    """Training steps of the checkpoints of a run, ascending."""
+    """Training steps of the checkpoints of a run, ascending; of a network of the package, its own alone."""
+    if has_network(run_dir):
+        report = read_report(run_dir)
+        return [report[unit] for unit in _UNITS if unit in report]
     folder = run_dir / FOLDER
     return sorted(int(path.name) for path in folder.iterdir() if path.name.isdigit()) if folder.is_dir() else []
 
@@ -201,6 +213,8 @@ def _first_undamaged(run_dir: Path, step: int | None, read: Callable[[Path], T])
     if step is not None and step not in steps:
         valid = ", ".join(map(str, steps))
         raise ValueError(f"checkpoint: expected one of {valid}, the steps that {str(run_dir)!r} has, got {step}")
+    if has_network(run_dir):
+        return steps[0], read(run_dir)
     candidates = steps[::-1] if step is None else [step]
     for candidate in candidates:
         path = _path(run_dir, candidate)
@@ -264,6 +278,8 @@ def _max_bytes(file: Path) -> int:
 
 
 def _read_params(path: Path, template: Any) -> Any:
+    if has_network(path):
+        return read_params(path, template)
     file = path / _PARAMS
     try:
         return read_parameters(file, template, max_bytes=_max_bytes(file))

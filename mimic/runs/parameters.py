@@ -11,6 +11,9 @@ import numpy as np
 from mimic.base.files import open_file
 from mimic.base.npz import read_arrays
 
+PARAMETERS = "parameters.npz"  # of a trained network that comes with the package
+_MAX_BYTES = 2**26  # of these, as float64; the largest network of a preset has 2 MB
+
 
 class OtherParameters(ValueError):
     """A file with parameters of another network."""
@@ -28,14 +31,15 @@ def write_parameters(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
-def read_parameters(path: Path, template: Any, *, max_bytes: int, cast: bool = False) -> Any:
+def read_parameters(path: Path, template: Any, *, max_bytes: int, of_package: bool = False) -> Any:
     """The parameters in a file, with the structure of the template.
 
     Args:
       path: an npz file.
       template: arrays or shapes with the structure of the parameters.
       max_bytes: maximum size of all arrays, see `read_arrays`.
-      cast: whether numbers of other types are converted to those of the template.
+      of_package: whether numbers of other types are converted to those of the template, and its entries of which the
+        file has nothing, as the value network of a policy, are 0.
 
     Raises:
       OtherParameters: arrays of other names, shapes or types than those of the template.
@@ -43,11 +47,15 @@ def read_parameters(path: Path, template: Any, *, max_bytes: int, cast: bool = F
     """
     leaves = named_leaves(template)
     arrays = read_arrays(path, list(leaves), max_bytes)
+    if of_package and arrays:
+        entries = {name.split("/")[0] for name in arrays}
+        unused = {name: leaf for name, leaf in leaves.items() if name.split("/")[0] not in entries}
+        arrays |= {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in unused.items()}
     with open_file(path) as file, zipfile.ZipFile(file) as archive:
         stored = {name.removesuffix(".npy") for name in archive.namelist()}
     for name in [*leaves, *sorted(stored - leaves.keys())]:
         expected, got = _shape(leaves.get(name)), _shape(arrays.get(name)) if name in leaves else "an array"
-        if expected == got and not cast:
+        if expected == got and not of_package:
             expected, got = f"type {leaves[name].dtype}", f"type {arrays[name].dtype}"
         if expected != got:
             raise OtherParameters(f"{name}: expected {expected}, got {got}")
@@ -56,6 +64,24 @@ def read_parameters(path: Path, template: Any, *, max_bytes: int, cast: bool = F
             raise ValueError(f"{name}: expected finite numbers, got others")
     values = [arrays[name].astype(leaf.dtype, copy=False) for name, leaf in leaves.items()]
     return jax.tree.unflatten(jax.tree.structure(template), values)
+
+
+def has_network(folder: Path) -> bool:
+    """Whether a folder has the parameters of a trained network that comes with the package, and no checkpoints."""
+    return (folder / PARAMETERS).is_file()
+
+
+def read_params(folder: Path, template: Any) -> Any:
+    """The parameters of a trained network that comes with the package, with the template's structure and types.
+
+    Raises:
+      ValueError: the file is missing, cannot be read, or has parameters of another network.
+    """
+    path = folder / PARAMETERS
+    try:
+        return read_parameters(path, template, max_bytes=_MAX_BYTES, of_package=True)
+    except ValueError as error:
+        raise ValueError(f"{str(path)!r} cannot be read: {error}") from error
 
 
 def _shape(array: Any) -> str:

@@ -21,6 +21,7 @@ from mimic.runs.files import CONFIG, DEMONSTRATIONS
 from mimic.runs.lock import LOCK
 from mimic.runs.parameters import OtherParameters
 from mimic.trainers.config import PPOConfig, TrainConfig, trainer_config
+from mimic.trainers.pretrained import NETWORKS, pretrained_names
 from mimic.trainers.run_models import MODELS, with_original_models, with_saved_models
 
 _OF_NETWORKS = (  # keys on which the sizes of a run's networks depend
@@ -118,12 +119,24 @@ def _read_config(run_dir: Path) -> TrainConfig:
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error
 
 
-def given_run(run: str) -> tuple[Path, TrainConfig]:
-    """The directory and the config of the run of a command. Raises a ValueError for no run directory."""
+def given_run(run: str, key: str = "run", kind: str = "policy") -> tuple[Path, TrainConfig]:
+    """The directory and the config of the run of a command.
+
+    Args:
+      run: run directory, or the environment of a trained network of this kind that comes with mimic.
+      key: see `load_config`.
+      kind: "policy" or "pose_mapper".
+
+    Raises:
+      ValueError: it is neither; or see `load_config`.
+    """
+    run_dir, names = Path(run).expanduser(), pretrained_names(kind)
     if not run:
-        raise ValueError("run: expected a run directory, as in run=runs/NAME")
-    run_dir = Path(run).expanduser()
-    return run_dir, load_config(run_dir, "run")
+        raise ValueError(f"{key}: expected a run directory, as in {key}=runs/NAME, or one of {', '.join(names)}")
+    if run in names and not run_dir.exists():
+        run_dir = NETWORKS / f"{run}-{kind}"
+    check_run_dir(run_dir, key, f" or one of {', '.join(names)},")
+    return run_dir, load_config(run_dir, key)
 
 
 def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:

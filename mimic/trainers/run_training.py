@@ -30,6 +30,7 @@ from mimic.runs.files import CONFIG, reported_steps, write_report
 from mimic.runs.lock import RunLock
 from mimic.runs.loggers import WandbLogger, wandb_package
 from mimic.runs.metrics_log import MetricsLog
+from mimic.runs.parameters import has_network
 from mimic.runs.provenance import hardware
 from mimic.runs.signals import Interrupted, Signals, noted_signals
 from mimic.runs.stopwatch import Stopwatch
@@ -147,6 +148,8 @@ def _start(config: TrainConfig, resumed_dir: Path | None, trainer: Trainer, is_c
         if not config.init:
             return None
         init = Path(config.init).expanduser()
+        if has_network(init):
+            raise ValueError(f"init: expected a run directory with checkpoints, got {config.init!r}, a network alone")
         with errors_of_networks(resolved, init, "init"):
             return Checkpoint(0, load_checkpoint(init, trainer.params_template())[1], None, {})
     with errors_of_networks(resolved, resumed_dir, "resume"):

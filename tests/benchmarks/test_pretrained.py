@@ -11,7 +11,8 @@ from mimic.base.files import read_json
 from mimic.envs import env_config
 from mimic.runs.files import REPORT
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.pretrained.network import NETWORKS, read_network
+from mimic.trainers.pretrained import NETWORKS
+from mimic.trainers.pretrained.network import read_network
 from mimic.trainers.run_config import load_config
 from tests.helpers import pages
 from tests.helpers.untrained_run import untrained_run

@@ -39,7 +39,7 @@ from tests.helpers.bodies import bvh_text, person
         (["mapper=planar4dof", "learner.locked=[3]"], "learner: expected none with mapper="),
         (["mapper=planar4dof", "env=panda4dof"], "env: expected none with mapper=, which brings its own"),
         (["source=a.bvh", "expert=panda"], "expert: expected none with source=, which brings its own"),
-        (["mapper=planar4dof", "checkpoint=5"], "checkpoint: expected none with mapper=planar4dof, which comes"),
+        (["mapper=planar4dof", "checkpoint=5"], "checkpoint: expected one of 1966080, the steps that"),
         (["hand=near"], "hand: expected one of free, exact, relative, got 'near'"),
         (["hand=exact", "mapper=planar4dof"], "hand: expected none with run= or mapper=, which move the"),
         (["base=[0,0,0,1]"], "base: expected same or [x,y,z,yaw] with hand=exact or relative"),

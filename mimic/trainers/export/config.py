@@ -14,7 +14,7 @@ class ExportConfig:
     """Config of an export of a trained policy or pose mapper to a file.
 
     Attributes:
-      run: run directory.
+      run: run directory, or the environment of a policy that comes with mimic.
       out: exported file, or folder of a controller; must not exist.
       format: "onnx", or "controller": a policy with an inner loop and what a robot needs beside it.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.

@@ -21,6 +21,7 @@ from mimic.motions.demonstrations import Demonstrations, check_effort, concatena
 from mimic.motions.experts import MIXED
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
+from mimic.runs.parameters import has_network
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.ppo import ppo, report_rows
@@ -281,8 +282,8 @@ def run_environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationE
 
 
 def with_saved_demonstrations(config: EnvConfig, run_dir: Path | None) -> EnvConfig:
-    """The environment with the demonstrations of an existing run, if there is one."""
-    if run_dir is None:
+    """The environment with the demonstrations of an existing run; a network of the package has them recorded again."""
+    if run_dir is None or has_network(run_dir):
         return config
     saved = dataclasses.replace(config.demonstrations, path=str(run_dir / DEMONSTRATIONS), source="", kind=MIXED)
     return dataclasses.replace(config, demonstrations=saved)

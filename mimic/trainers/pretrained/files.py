@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 
 from mimic.runs.files import write_report
-from mimic.runs.parameters import named_leaves, read_parameters
+from mimic.runs.parameters import PARAMETERS, named_leaves
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import save_config
 
-PARAMETERS = "parameters.npz"
 SOURCE = "source"  # key of the report: command and commit that trained the network
-_MAX_BYTES = 2**26  # of the parameters, as float64; the largest network of a preset has 2 MB
 
 
 def write_network(
@@ -37,19 +35,6 @@ def write_network(
     save_config(folder, dataclasses.replace(config, run_dir="", resume="", init=""))
     os.replace(partial, folder / PARAMETERS)
     write_report(folder, report)
-
-
-def read_params(folder: Path, template: Any) -> Any:
-    """The parameters of a trained network, with the structure and the types of the template.
-
-    Raises:
-      ValueError: the file is missing, cannot be read, or has parameters of another network.
-    """
-    path = folder / PARAMETERS
-    try:
-        return read_parameters(path, template, max_bytes=_MAX_BYTES, cast=True)
-    except ValueError as error:
-        raise ValueError(f"{str(path)!r} cannot be read: {error}") from error
 
 
 def _stored(params: Any, half: bool) -> dict[str, np.ndarray]:

@@ -15,14 +15,15 @@ from mimic.arms.embodiment import Embodiment
 from mimic.base import compat
 from mimic.base.config import check_choice
 from mimic.runs.files import read_report
+from mimic.runs.parameters import read_params
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.pretrained.files import SOURCE, read_params
+from mimic.trainers.pretrained import NETWORKS, pretrained_names
+from mimic.trainers.pretrained.files import SOURCE
 from mimic.trainers.run_config import load_config
 
 if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv
 
-NETWORKS = Path(__file__).parent / "networks"
 TRAINERS = {"policy": "ppo", "pose_mapper": "pose_mapper"}  # of each kind of network
 _ORIGIN = ("env", "trainer", "seed", "env_steps", "training_poses", "wall_time_s", "hardware", "versions")
 
@@ -110,11 +111,6 @@ def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> Pretra
     check_choice("kind", kind, tuple(TRAINERS))
     check_choice("name", name, pretrained_names(kind))
     return read_network(NETWORKS / f"{name}-{kind}", kind)
-
-
-def pretrained_names(kind: str) -> tuple[str, ...]:
-    """The environments with a trained network of this kind."""
-    return tuple(sorted(path.name.removesuffix(f"-{kind}") for path in NETWORKS.glob(f"*-{kind}")))
 
 
 def read_network(folder: Path, kind: str) -> Pretrained:

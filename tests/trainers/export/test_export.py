@@ -142,7 +142,7 @@ def mapped(tmp_path_factory):
     [
         ([], "out: expected a file"),
         (["out=new.onnx", "run="], "run: expected a run directory, as in run=runs/NAME"),
-        (["out=new.onnx", "run=missing"], "run: expected a run directory, which has a config.yaml, got 'missing'"),
+        (["out=new.onnx", "run=missing"], "run: expected a run directory, which has a config.yaml, or one of panda"),
         ([f"out={__file__}"], "exists; name a new file"),
         (["out=new.pdf"], "out: expected a file that ends in .onnx, got 'new.pdf'"),
         (["out=no/new.onnx"], "there is no folder 'no'"),

@@ -3,17 +3,27 @@
 import dataclasses
 import json
 import shutil
+from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
 import mimic
+from mimic.commands.clips import prepare_clip
+from mimic.commands.config import EvaluateConfig, RenderConfig
+from mimic.commands.evaluate import prepare_evaluation
 from mimic.evaluation.evaluator import Evaluator
+from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.files import REPORT
+from mimic.runs.parameters import PARAMETERS, read_params
 from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
-from mimic.trainers.pretrained.files import PARAMETERS, read_params, write_network
-from mimic.trainers.pretrained.network import NETWORKS, TRAINERS, policy_template, pretrained_names, read_network
+from mimic.trainers.ppo import ppo
+from mimic.trainers.pretrained import NETWORKS, pretrained_names
+from mimic.trainers.pretrained.files import write_network
+from mimic.trainers.pretrained.network import TRAINERS, policy_template, read_network
+from mimic.trainers.run_config import policy_run
 
 MAX_BYTES = 5_000_000  # of all of them: the package stays small
 OBSERVATION = 254  # numbers that the policy of planar4dof observes
@@ -87,6 +97,42 @@ def test_a_policy_reads_what_its_environment_observes(terms):
     env = mimic.make("planar4dof", **changes)
     statistics, _ = policy_template(dataclasses.replace(mimic.load("planar4dof").config, env=env.config))
     assert statistics.mean.shape == (env.observation_size,) == (OBSERVATION - (0 if terms is None else 8),)
+
+
+def test_commands_take_the_environment_of_a_policy_as_their_run(tmp_path, monkeypatch):
+    """Its parameters are those of `mimic.load`; it has no value network, whose parameters are 0."""
+    monkeypatch.chdir(tmp_path)
+    run_dir, config = policy_run("planar4dof", None)
+    template = ppo.params_template(config.trainer, OBSERVATION, 4, 3)  # type: ignore[arg-type]
+    steps, params = load_checkpoint(run_dir, template)
+    policy = mimic.load("planar4dof")
+    assert steps == policy.source["env_steps"] and jax.tree.structure(params) == jax.tree.structure(template)
+    assert not any(leaf.any() for leaf in jax.tree.leaves(params[2]))
+    observations = np.random.default_rng(0).uniform(-1, 1, (3, OBSERVATION)).astype(np.float32)
+    controller = ppo.make_controller(config.trainer, OBSERVATION, 4)(params)  # type: ignore[arg-type]
+    actions = jax.jit(lambda obs: controller(SimpleNamespace(obs=obs)))(observations)  # type: ignore[arg-type]
+    np.testing.assert_allclose(actions, jax.jit(policy)(observations), atol=1e-6)  # float32, compiled apart
+    (tmp_path / "planar4dof").mkdir()  # the user's own folder comes first
+    with pytest.raises(ValueError, match="which has a config.yaml, or one of panda3dof, .*, got 'planar4dof'"):
+        policy_run("planar4dof", None)
+
+
+def test_a_training_does_not_start_from_a_policy_without_a_value_network(reason):
+    few = "env.demonstrations.count=1", "env.demonstrations.held_out=1"
+    line = reason("train", "env=planar4dof", f"init={NETWORKS / 'planar4dof-policy'}", *few)
+    assert line.startswith("init: expected a run directory with checkpoints, got ") and "a network alone" in line
+
+
+@pytest.mark.slow
+def test_a_policy_is_evaluated_and_shown_without_a_run_directory(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(NETWORKS.rglob("*"))
+    prepare_evaluation(EvaluateConfig("planar4dof", out="report"), 0.0)()
+    report, recorded = json.loads((tmp_path / "report" / REPORT).read_text()), mimic.load("planar4dof").report
+    # Another machine or version rounds differently, and the demonstrations are recorded anew.
+    assert report["mean_distance"] == pytest.approx(recorded["mean_distance"], rel=1e-3)
+    assert prepare_clip(RenderConfig("planar4dof")).out == Path("planar4dof-held_out-0.mp4")
+    assert sorted(NETWORKS.rglob("*")) == before and [path.name for path in tmp_path.iterdir()] == ["report"]
 
 
 def test_inputs_of_another_size_are_reported():
