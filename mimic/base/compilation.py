@@ -136,10 +136,7 @@ def compiled_once(
     def compiled(*arguments: Any) -> Callable[..., T]:
         return _compiled(make(*arguments), options)
 
-    def of_trace(*arguments: Any) -> Callable[..., T]:
-        return jax.jit(make(*arguments))
-
-    return functools.wraps(make)(by_value(compiled, of_trace))
+    return functools.wraps(make)(by_value(compiled, lambda *arguments: jax.jit(make(*arguments))))
 
 
 def _compiled(function: Callable[..., T], options: Mapping[str, Any]) -> Callable[..., T]:

@@ -1,7 +1,8 @@
 """Demonstrations from motion capture, and the inspection of a captured motion."""
 
 import dataclasses
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ def read_arm(source: Path, side: str, config: CaptureConfig, fixed: float = 0.0)
     pieces, bridged = bridge_gaps(used)
     label = "both arms" if side == BOTH else f"the {side} arm"
     # Split where a point jumps: a first frame in another pose, or markers that were exchanged.
-    pieces = [piece.cut(*span) for piece in pieces for span in _between(jumps(piece), len(piece.positions))]
+    pieces = [piece.cut(*span) for piece in pieces for span in _between_jumps(piece)]
     pieces = [piece for piece in pieces if len(piece.positions) > 1]
     if not pieces:
         raise ValueError(f"source: {str(source)!r} has no time at which all points of {label} are known")
@@ -275,9 +276,8 @@ def _slow_down_for_windows(capture: Capture, env: EnvConfig) -> float:
     return slow_down_for_windows(capture.parts, env.horizon * env.control_dt)
 
 
-def _between(cuts: np.ndarray, length: int) -> list[tuple[int, int]]:
-    edges = [0, *map(int, cuts), length]
-    return list(zip(edges[:-1], edges[1:], strict=True))
+def _between_jumps(piece: PointMotion) -> Iterator[tuple[int, int]]:
+    return itertools.pairwise([0, *map(int, jumps(piece)), len(piece.positions)])
 
 
 def _with_lengths(part: LinkMotion, lengths: np.ndarray) -> LinkMotion:

@@ -20,15 +20,13 @@ from mimic.metric.config import MetricConfig
 from mimic.metric.distance import Metric
 from mimic.metric.kinematics import link_state_table
 from mimic.retargeting.base_placement import POSITION_ALONE, best_bases, repeated
-from mimic.retargeting.certificate import POSITION, ROTATION
+from mimic.retargeting.certificate import NO_FLOOR, POSITION, ROTATION, TOUCHING
 from mimic.retargeting.hand_speeds import speeds_needed
 from mimic.retargeting.hand_target import Placement
 from mimic.retargeting.pose import imitate_pose
 
 _POSES, _DRAWN = 1024, 4096  # of the expert: those that are compared, and from which they are chosen
 _FRAMES = 16  # of them, that a base is searched with
-_TOUCHING = -0.01  # m: capsules are larger than the shapes that they contain
-_NO_FLOOR = -1e3  # m; what the arm stands on is not known
 _KINDS = ("exact", "position alone", "not reached")
 _COLOURS = ("tab:green", "tab:orange", "tab:red")
 _WORST = 5  # percent of the poses
@@ -91,7 +89,8 @@ def hand_reach(expert: ArmConfig, learner: ArmConfig, metric: MetricConfig, base
       metric: chooses among the postures with this hand.
       base: [x, y, z, yaw] of the learner, None for the expert's, or "auto" for the one from which most are exact.
     """
-    pair = _hardware_arms(expert, learner)
+    arms = ArmPair(*(build_arm(dataclasses.replace(arm, home=None), "hardware") for arm in (expert, learner)))
+    pair = arms.embodiments
     qpos = _poses(pair[0], _capsules(expert))
     built = metric.build(*pair)
     bases = np.zeros((1, 4)) if base is None or isinstance(base, str) else np.reshape(base, (1, 4))
@@ -102,14 +101,8 @@ def hand_reach(expert: ArmConfig, learner: ArmConfig, metric: MetricConfig, base
     reached = [_reach(pair, built, qpos, base) for base in bases]
     reach, postures = max(reached, key=lambda result: result[0].score)
     capsules = _capsules(learner)
-    touches = None if capsules is None else _clearances(pair[1], capsules, postures) < _TOUCHING
+    touches = None if capsules is None else _clearances(pair[1], capsules, postures) < TOUCHING
     return dataclasses.replace(reach, touches=touches)
-
-
-def _hardware_arms(expert: ArmConfig, learner: ArmConfig) -> tuple[Embodiment, Embodiment]:
-    """Both arms within the limits of their models."""
-    arms = ArmPair(*(build_arm(dataclasses.replace(arm, home=None), "hardware") for arm in (expert, learner)))
-    return arms.embodiments
 
 
 def _poses(arm: Embodiment, capsules: Capsules | None) -> Float[np.ndarray, "poses joints"]:
@@ -117,7 +110,7 @@ def _poses(arm: Embodiment, capsules: Capsules | None) -> Float[np.ndarray, "pos
     lower, upper = np.asarray(arm.joint_range).T
     qpos = np.random.default_rng(0).uniform(lower, upper, (_DRAWN, arm.num_joints)).astype(np.float32)
     if capsules is not None:
-        order = np.argsort(_clearances(arm, capsules, qpos) < _TOUCHING, kind="stable")  # those that do come last
+        order = np.argsort(_clearances(arm, capsules, qpos) < TOUCHING, kind="stable")  # those that do come last
         qpos = qpos[order]
     return qpos[:_POSES]
 
@@ -131,7 +124,7 @@ def _capsules(arm: ArmConfig) -> Capsules | None:
 
 
 def _clearances(arm: Embodiment, capsules: Capsules, qpos: np.ndarray) -> Float[np.ndarray, " poses"]:
-    return clearance(np.asarray(qpos, np.float32), clearance_constants(arm, capsules, _NO_FLOOR))
+    return clearance(np.asarray(qpos, np.float32), clearance_constants(arm, capsules, NO_FLOOR))
 
 
 def _reach(

@@ -17,6 +17,7 @@ FORMAT = "mimic-demonstrations-1"
 _IMPORT = "python -m mimic.demonstrations source=FILE out=NEW.npz imports motions of other formats"
 _ARRAYS = ("qpos", "qvel", "goals", "dt", "seed", "arm", "joint_names", "format")
 _OPTIONAL_ARRAYS = ("torque", "gripper", "gripper_names", "kinds")
+_BY_MOTION = ("qpos", "qvel", "goals", "torque", "gripper")  # arrays with a row for each motion, the last two optional
 CLIPS = "clips"  # kind of the motions of a file that does not say what drove them
 MAX_VALUE = 1e6  # rad, rad/s, N m, s: no arm's motion has larger values
 _STILL = 0.3  # probability that a joint of a smaller crossover stays at the start
@@ -71,17 +72,8 @@ class Demonstrations:
 
     def select(self, index: slice | Sequence[int]) -> "Demonstrations":
         """The demonstrations with these indices."""
-        torque, gripper = (None if values is None else values[index] for values in (self.torque, self.gripper))
-        kinds = tuple(map(str, np.array(self.kinds, dtype=str)[index]))
-        return dataclasses.replace(
-            self,
-            qpos=self.qpos[index],
-            qvel=self.qvel[index],
-            goals=self.goals[index],
-            torque=torque,
-            gripper=gripper,
-            kinds=kinds,
-        )
+        arrays = {key: values[index] for key in _BY_MOTION if (values := getattr(self, key)) is not None}
+        return dataclasses.replace(self, **arrays, kinds=tuple(map(str, np.array(self.kinds, dtype=str)[index])))
 
     def of_length(self, steps: int) -> "Demonstrations":
         """The demonstrations with another number of steps: shortened, or with the last sample repeated.
@@ -98,23 +90,11 @@ class Demonstrations:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one `.npz` file; an existing file is replaced only when the new one is complete."""
         partial = f"{os.fspath(path)}.partial"
-        optional: dict[str, Any] = {} if self.torque is None else {"torque": self.torque}
-        if self.gripper is not None:
-            optional |= {"gripper": self.gripper, "gripper_names": np.array(self.gripper_names)}
+        content = {"format": FORMAT} | {key: value for key, value in vars(self).items() if value is not None}
+        if self.gripper is None:
+            del content["gripper_names"]
         with open(partial, "wb") as file:
-            np.savez_compressed(
-                file,
-                format=np.array(FORMAT),
-                qpos=self.qpos,
-                qvel=self.qvel,
-                goals=self.goals,
-                dt=np.array(self.dt),
-                seed=np.array(self.seed),
-                arm=np.array(self.arm),
-                joint_names=np.array(self.joint_names),
-                kinds=np.array(self.kinds),
-                **optional,
-            )
+            np.savez_compressed(file, **{key: np.asarray(value) for key, value in content.items()})  # type: ignore[arg-type]
         os.replace(partial, path)
 
     def check_fits(self, arm: Embodiment, dt: float, horizon: int) -> None:
@@ -136,20 +116,14 @@ class Demonstrations:
 
 def concatenate(first: Demonstrations, second: Demonstrations) -> Demonstrations:
     """Joins two sets of demonstrations of one arm and time step. Torques and grippers are kept if both have them."""
-    joined = {key: np.concatenate([getattr(first, key), getattr(second, key)]) for key in ("qpos", "qvel", "goals")}
-    torques = [part.torque for part in (first, second) if part.torque is not None]
-    torque = np.concatenate(torques) if len(torques) == 2 else None
-    grippers = [part.gripper for part in (first, second) if part.gripper is not None]
-    is_kept = len(grippers) == 2 and first.gripper_names == second.gripper_names
-    gripper = np.concatenate(grippers) if is_kept else None
-    return dataclasses.replace(
-        first,
-        **joined,
-        torque=torque,
-        gripper=gripper,
-        gripper_names=first.gripper_names if is_kept else (),
-        kinds=first.kinds + second.kinds,
-    )
+    joined: dict[str, Any] = {}
+    for key in _BY_MOTION:
+        parts = [getattr(first, key), getattr(second, key)]
+        joined[key] = None if any(part is None for part in parts) else np.concatenate(parts)
+    if first.gripper_names != second.gripper_names:
+        joined["gripper"] = None
+    names = () if joined["gripper"] is None else first.gripper_names
+    return dataclasses.replace(first, **joined, gripper_names=names, kinds=first.kinds + second.kinds)
 
 
 def check_effort(demonstrations: Demonstrations, arm: Embodiment, speed: float = 1.0) -> None:

@@ -18,9 +18,9 @@ from mimic.retargeting.exact_chunks import by_chunks
 from mimic.retargeting.hand_target import placement
 
 POSITION, ROTATION = 1e-3, np.radians(0.5)  # m, rad: a hand within both is where the expert's is
-_NO_FLOOR = -1e3  # m; what the arm stands on is not known
+NO_FLOOR = -1e3  # m; what the arm stands on is not known
 _AT_LIMIT, _AT_RANGE = 0.999, 1e-3  # fraction of the velocity limit; rad from the end of a range
-_TOUCHING = -0.01  # m, where contacts are not known: capsules are larger than the shapes that they contain
+TOUCHING = -0.01  # m, where contacts are not known: capsules are larger than the shapes that they contain
 _ROUNDING = 1e-5  # rad, relative: of single precision
 
 
@@ -110,8 +110,8 @@ def certify(
     steps = np.concatenate([steps, np.zeros((1, qpos.shape[1]))])  # after the last frame the arm stands
     clearance = np.full(len(qpos), np.nan)
     if capsules is not None:
-        clearance = control_clearance.clearance(qpos, clearance_constants(learner, capsules, _NO_FLOOR))
-    touches = clearance < _TOUCHING
+        clearance = control_clearance.clearance(qpos, clearance_constants(learner, capsules, NO_FLOOR))
+    touches = clearance < TOUCHING
     if contacts is not None:
         touches = clearance < 0
         touches[touches] = contacts(qpos[touches])

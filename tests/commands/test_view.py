@@ -23,6 +23,7 @@ from mimic.motions.mocap.live_hand import LiveHand
 from mimic.motions.mocap.live_points import Sample, sample_line
 from mimic.runs.signals import Signals
 from tests.helpers.bodies import bvh_text, person
+from tests.helpers.commands import free_port
 
 
 @pytest.mark.parametrize(
@@ -99,12 +100,6 @@ def test_a_view_that_others_can_reach_says_so(host, warned, capsys):
     output = capsys.readouterr()
     assert shown and f"view: http://127.0.0.1:{config.port}" in output.out and "view: ended\n" in output.out
     assert ("everyone who can reach this machine" in output.err) == warned
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.fixture

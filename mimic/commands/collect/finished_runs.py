@@ -234,8 +234,5 @@ def _history(path: Path) -> dict[str, dict[int, float]]:
 def _numbers(report: Mapping[str, Any]) -> dict[str, float]:
     """The numbers of a report by dotted keys; null, which replaces values that are not finite, is left out."""
     flat = flatten({key: report[key] for key in report if key not in ("worst_demonstrations", "arms", "seed")})
-    return {key: x for key, x in flat.items() if _is_number(x) and not key.startswith("hardware")}
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and abs(value) < math.inf
+    numbers = {key: x for key, x in flat.items() if isinstance(x, int | float) and abs(x) < math.inf}
+    return {key: x for key, x in numbers.items() if not key.startswith("hardware")}

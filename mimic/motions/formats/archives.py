@@ -1,5 +1,6 @@
 """Reads joint motions from npz files in LocoMuJoCo's format."""
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,7 @@ def read_archive(path: Path, joints: Sequence[str]) -> Recording:
         )
     motions = {
         f"motion {number}": motion.take(slice(start, end))
-        for number, (start, end) in enumerate(zip(bounds[:-1], bounds[1:], strict=True))
+        for number, (start, end) in enumerate(itertools.pairwise(bounds))
     }
     return Recording(motions, notes=tuple(notes), **selection.facts)
 

@@ -133,17 +133,10 @@ def episodes(file: Any) -> Iterator[tuple[str, Episode]]:
 
 def _entries(episode: Episode, layout: _Layout | None) -> dict[str, list[str]]:
     """The data sets of angles with the names of their columns: numbers from 1, where nothing names them."""
-    entries = {
-        name: [str(number) for number in range(1, width + 1)]
-        for name, width in _widths(episode)
-        if _ANGLES.fullmatch(name.split("/")[-1])
-    }
-    entries |= {
-        name: [str(number) for number in range(1, width + 1)]
-        for name, width in _widths(episode)
-        if is_command(name) and any(_follows(episode, name, entry) for entry in list(entries))
-    }
-    return entries | ({STATES: list(layout.qpos)} if layout else {})
+    numbered = _numbered(episode)
+    entries = {name: columns for name, columns in numbered.items() if _ANGLES.fullmatch(name.split("/")[-1])}
+    commands = [name for name in numbered if is_command(name) and any(_follows(episode, name, x) for x in entries)]
+    return entries | {name: numbered[name] for name in commands} | ({STATES: list(layout.qpos)} if layout else {})
 
 
 def _follows(episode: Episode, command: str, entry: str) -> bool:
@@ -155,8 +148,9 @@ def _follows(episode: Episode, command: str, entry: str) -> bool:
 
 def _motion(episode: Episode, layout: _Layout | None, selection: Selection, rate: float | None) -> Motion:
     """The motion of an episode."""
+    numbered = _numbered(episode)
     for entry in filter(None, (selection.entry, selection.gripper_entry)):
-        found = dict(_widths(episode)).get(entry, 0)
+        found = len(numbered.get(entry, ()))
         numbers = selection.joints if entry == selection.entry else selection.gripper
         expected = 1 if entry == STATES and layout else max(map(int, numbers))
         if found < expected:
@@ -175,7 +169,6 @@ def _motion(episode: Episode, layout: _Layout | None, selection: Selection, rate
         channels = _columns(episode.sets[selection.gripper_entry])
         at = layout.qpos if selection.gripper_entry == STATES and layout else None
         gripper = channels[:, [at[name] if at else int(name) - 1 for name in selection.gripper]]
-    numbered = {name: [str(column) for column in range(1, width + 1)] for name, width in _widths(episode)}
     found = hand_position({name: columns for name, columns in numbered.items() if len(episode.sets[name]) == len(qpos)})
     hand = _columns(episode.sets[found[0]])[:, :3] if found else None
     steps, objects = _hand_steps(episode, len(qpos)), None
@@ -186,9 +179,10 @@ def _motion(episode: Episode, layout: _Layout | None, selection: Selection, rate
     return Motion(_times(episode, len(qpos), layout, rate), qpos, qvel, gripper, hand, steps, objects)
 
 
-def _widths(episode: Episode) -> Iterator[tuple[str, int]]:
-    """The data sets and their numbers of columns."""
-    yield from ((name, item.shape[1] if item.ndim == 2 else 1) for name, item in episode.sets.items())
+def _numbered(episode: Episode) -> dict[str, list[str]]:
+    """The data sets with the numbers of their columns, from 1."""
+    widths = {name: item.shape[1] if item.ndim == 2 else 1 for name, item in episode.sets.items()}
+    return {name: [str(number) for number in range(1, width + 1)] for name, width in widths.items()}
 
 
 def _hand_steps(episode: Episode, count: int) -> np.ndarray | None:

@@ -1,5 +1,6 @@
 """Writes a LeRobot dataset, version 2 or 3, again for another arm; other features and videos stay as they are."""
 
+import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -160,7 +161,7 @@ def _write_data(source: Path, out: Path, plan: _Plan, is_old: bool) -> None:
 def _runs(episode: np.ndarray) -> Iterator[tuple[int, slice]]:
     """Each episode in a file, and its rows."""
     edges = [0, *(np.flatnonzero(np.diff(episode)) + 1), len(episode)]
-    for start, stop in zip(edges[:-1], edges[1:], strict=True):
+    for start, stop in itertools.pairwise(edges):
         yield int(episode[start]), slice(int(start), int(stop))
 
 
