@@ -146,6 +146,24 @@ def _suggested_key(key: str, parent: DictConfig) -> str:
     return f"; did you mean {same_name}?" if same_name else suggestion(key, siblings)
 
 
+def with_full_keys(line: str, config: DictConfig, given: Collection[str]) -> str:
+    """The line of an error with the keys in front in full, as env.control: for control:, unless they are given as such.
+
+    Args:
+      line: of the error, which knows the keys of one dataclass in the config.
+      config: config of a command.
+      given: keys that the user wrote.
+    """
+    front, colon, rest = line.partition(":")
+    keys, names = front.split(", "), {key for key, _ in _keys(config)}
+    if not any(f"{other}.".startswith(f"{key}.") for key in keys for other in given):
+        for group in config if names.isdisjoint(keys) else ():
+            full = [f"{group}.{key}" for key in keys]
+            if names.issuperset(full):
+                return ", ".join(full) + colon + rest
+    return line
+
+
 def _keys(node: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
     """Dotted keys of a config with the last name of each, without Hydra's own."""
     for name in node if isinstance(node, DictConfig) and not node._is_none() and not node._is_missing() else ():

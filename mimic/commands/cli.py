@@ -24,7 +24,7 @@ from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic.base import compat, registry
-from mimic.base.config import BAD_INPUT, explain, schema, suggestion, typed
+from mimic.base.config import BAD_INPUT, explain, schema, suggestion, typed, with_full_keys
 from mimic.base.distribution import VERSION
 from mimic.base.files import read_text
 from mimic.commands.arguments import check_arguments, load_plugins, quoted
@@ -84,6 +84,7 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         print(f"mimic {VERSION}")
         return
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
+    given = [argument.partition("=")[0].lstrip("+") for argument in sys.argv[1:]]
     try:
         sys.argv[1:] = expand_arguments(load_plugins(sys.argv[1:]), config_name)
         register()
@@ -95,7 +96,16 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
     def command(config: DictConfig) -> Outcome:
         nonlocal is_composed
         is_composed = True
-        return _sweep_run(prepare, config) if is_sweep() else _single_run(prepare, config)
+
+        def prepare_typed() -> Work:
+            try:
+                return prepare(typed(config))
+            except ValueError as error:
+                if isinstance(error, OmegaConfBaseException):
+                    raise
+                raise ValueError(with_full_keys(str(error), config, given)) from error
+
+        return _sweep_run(prepare_typed) if is_sweep() else _single_run(prepare_typed)
 
     try:
         with watched_signals():
@@ -140,11 +150,11 @@ def register() -> None:
     bound_config_files()
 
 
-def _single_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
+def _single_run(prepare: Callable[[], Work]) -> Outcome:
     """The run of a command without a sweep; ends the process where it fails."""
     try:
         check_launcher(HydraConfig.get().runtime.choices["hydra/launcher"])
-        work = prepare(typed(config))
+        work = prepare()
     except _BAD_INPUT as error:
         _exit_with_error(error)
     try:
@@ -156,10 +166,10 @@ def _single_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
     return Outcome()
 
 
-def _sweep_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
+def _sweep_run(prepare: Callable[[], Work]) -> Outcome:
     """One run of a sweep in this process. The other runs continue after a failure, but a signal ends them all."""
     try:
-        work = prepare(typed(config))
+        work = prepare()
     except _BAD_INPUT as error:
         return _failed_run(error, BAD_INPUT)
     try:

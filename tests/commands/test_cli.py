@@ -34,6 +34,17 @@ from tests.helpers.repository import REPOSITORY
         (["trainer=pose_mapper", "trainer.num_envs=8"], "unknown key 'trainer.num_envs'; valid are name, preset"),
         (["env=panda4dfo"], "; did you mean panda4dof?\n"),
         (["learning_rate=1"], "; did you mean trainer.learning_rate?\n"),
+        (["env.learner.locked=[9]"], "error: env.learner.locked: unknown joint 9"),
+        (["learner.locked=[9]"], "error: learner.locked: unknown joint 9"),
+        (
+            ["env=pair", "env.learner.model=panda", "expert=panda", "env.learner.tip=x"],
+            "env.learner.tip: expected",
+        ),
+        (["world=ideal", "env.control_dt=0.0015"], "error: env.control_dt: expected a multiple of 0.001 s"),
+        (
+            ["env.demonstrations.path=a.npz", "env.demonstrations.kind=reach"],
+            "env.demonstrations.kind: expected",
+        ),
     ],
 )
 def test_bad_training_input(rejected, arguments, message):
