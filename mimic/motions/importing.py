@@ -216,7 +216,9 @@ def read_source(source: Path, names: Sequence[str], topic: str, rate: float | No
     if not source.is_file():
         raise ValueError(f"source: no file at {str(source)!r}")
     if not source.name.lower().endswith(SOURCES):
-        raise ValueError(f"source: expected a file that ends in {', '.join(SOURCES)}, got {str(source)!r}")
+        is_clip = source.suffix.lower() in (".bvh", ".c3d", ".trc")
+        advice = f"; python -m mimic.demonstrations source={source} arm=left out=FILE.npz reads it" if is_clip else ""
+        raise ValueError(f"source: expected a file that ends in {', '.join(SOURCES)}, got {str(source)!r}{advice}")
     if is_demonstrations(source):
         raise ValueError(
             f"source: {str(source)!r} has demonstrations in mimic's own format, which need no import; "

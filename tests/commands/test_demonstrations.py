@@ -48,6 +48,10 @@ def test_the_command_records_what_the_library_does(tmp_path):
             ["out=new.npz", "source={recorded}"],
             "recorded.npz' has demonstrations in mimic's own format, which need no import; env.demonstrations.path=",
         ),
+        (
+            ["out=new.npz", "source={recorded}", "arm=left"],
+            "expected points as names, positions, and time or rate, got demonstrations of an arm's joints",
+        ),
         (["out=new.npz", "source={csv}", "topic=/a"], "topic: expected only for a LeRobot dataset, a rosbag2 or HDF5"),
         (["out=new.npz", "topic=/a"], "topic: expected none without source="),
         (["out=new.npz", "joints=[a]"], "joints: expected none without source=FILE"),

@@ -57,6 +57,7 @@ def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows():
         (["source=none.csv", "base=[1,2]"], "base: expected same, auto or [x,y,z,yaw], got [1, 2]"),
         (["source=none.csv", "failing=maybe"], "failing: expected one of left_out, kept"),
         (["source=none.csv", "out=new"], "source: no file at 'none.csv'"),
+        (["source={clip}", "out=new"], "python -m mimic.demonstrations source="),
         (["source=certificate.npz", "out=new"], "source: expected another name than certificate.npz"),
         (["source=none.csv", "out=new", "costs.velocity=1"], "costs: expected no velocity or acceleration"),
         (["source=none.csv", "out=new", "hand=scaled", "base=auto"], "base: expected no auto with hand=scaled"),
@@ -67,7 +68,8 @@ def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows():
     ],
 )
 def test_bad_input(reason, recorded, arguments, message):
-    assert message in reason("retarget", *(argument.format(recorded=recorded) for argument in arguments))
+    (clip := recorded.with_name("clip.bvh")).touch()
+    assert message in reason("retarget", *(argument.format(recorded=recorded, clip=clip) for argument in arguments))
 
 
 def test_bad_input_of_the_command(rejected):

@@ -9,6 +9,7 @@ import numpy as np
 
 from mimic.base.files import read_text
 from mimic.base.npz import read_arrays
+from mimic.motions.demonstrations import is_demonstrations
 from mimic.motions.formats.names import UNSEEN
 
 _MAX_POINTS = 2000
@@ -120,7 +121,8 @@ def read_npz(path: Path) -> Table:
     """
     content = read_arrays(path, _ARRAYS)
     if not {"names", "positions"} <= content.keys() or not content.keys() & {"time", "rate"}:
-        raise ValueError("expected names, positions, and time or rate")
+        joints = "demonstrations of an arm's joints; those need no arm=" if is_demonstrations(path) else "others"
+        raise ValueError(f"expected points as names, positions, and time or rate, got {joints}")
     positions, names = content["positions"], content["names"]
     if names.ndim != 1 or names.dtype.kind != "U":
         raise ValueError(f"names: expected a list of texts, got {names.dtype} of shape {names.shape}")
