@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.arm import ArmConfig, arm_spec, build_arm
+from mimic.arms.embodiment import Embodiment
 from mimic.arms.kinematic_tree import ChainIds, find_chain
 from mimic.arms.model_tree import ancestors
 from mimic.arms.mujoco_chain import data_at_zero
@@ -47,6 +48,10 @@ class Capsules:
     def near_base(self) -> tuple[bool, ...]:
         """Whether each capsule is on the base, or on a joint whose parent is the base."""
         return tuple(joint < 0 or self._parent(joint) < 0 for joint in self.joint)
+
+    def links(self, arm: Embodiment) -> list[str]:
+        """What each capsule of an arm is around, in words."""
+        return ["the base" if joint < 0 else f"the link of {arm.joint_names[joint]}" for joint in self.joint]
 
     def _parent(self, joint: int) -> int:
         return joint - 1 if self.joint_parent is None else self.joint_parent[joint]

@@ -288,6 +288,7 @@ def _print(
         first, last, cause = max(runs, key=lambda run: run[1] - run[0])
         more = f", and {len(runs) - 1} more times" if len(runs) > 1 else ""
         lines.append(f"{name} fails: {cause}, frames {first} to {last}{more}")
+    lines += _overlap_lines(certificates)
     lines += [f"not retargeted: {name}: {fault}" for name, fault in list(data.faults.items())[:_SHOWN]]
     base = setting.base or [0.0, 0.0, 0.0, 0.0]
     lines.append(f"base of {setting.learner.name} in that of {setting.expert.name} [m, rad]: {base}")
@@ -295,6 +296,16 @@ def _print(
     lines += [f"commands: {', '.join(data.commands) or 'none'}"]
     lines.append(_gripper_line(data, setting))
     say(console, *lines, *written, *filter(None, [_help_line(certificates, setting)]))
+
+
+def _overlap_lines(certificates: Mapping[str, Certificate]) -> list[str]:
+    """What a negative clearance means, with the links of the smallest one."""
+    smallest = {name: float(item.clearance.min()) for name, item in certificates.items() if item.clearance.min() < 0}
+    if not smallest:
+        return []
+    name = min(smallest, key=smallest.__getitem__)
+    overlap = f"{certificates[name].nearest} overlap, by {-1e3 * smallest[name]:.0f} mm in {name}"
+    return [f"clearance below 0: capsules around {overlap}; whether links touch, their shapes decide"]
 
 
 def _number(value: float, digits: int) -> str:

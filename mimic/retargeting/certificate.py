@@ -36,6 +36,7 @@ class Certificate:
       clearance: between capsules around the learner's links [m], negative where these touch; NaN where its shapes are
         not known.
       causes: why a frame fails; empty where it does not.
+      nearest: the two links of the smallest clearance, where it is known.
     """
 
     position: Float[np.ndarray, " frames"]
@@ -44,6 +45,7 @@ class Certificate:
     speed: Float[np.ndarray, " frames"]
     clearance: Float[np.ndarray, " frames"]
     causes: tuple[str, ...]
+    nearest: str = ""
 
     @property
     def is_exact(self) -> Bool[np.ndarray, " frames"]:
@@ -108,9 +110,14 @@ def certify(
     margins = np.minimum(qpos - lower, upper - qpos)
     steps = np.abs(np.diff(qpos, axis=0)) / largest_jump
     steps = np.concatenate([steps, np.zeros((1, qpos.shape[1]))])  # after the last frame the arm stands
-    clearance = np.full(len(qpos), np.nan)
+    clearance, nearest = np.full(len(qpos), np.nan), ""
     if capsules is not None:
-        clearance = control_clearance.clearance(qpos, clearance_constants(learner, capsules, NO_FLOOR))
+        constants = clearance_constants(learner, capsules, NO_FLOOR)
+        clearance = control_clearance.clearance(qpos, constants)
+        if len(constants.pairs):
+            axes = control_clearance.capsule_axes(qpos[clearance.argmin()], constants)
+            pair = constants.pairs[control_clearance.pair_distances(*axes, constants).argmin()]
+            nearest = " and ".join(capsules.links(learner)[capsule] for capsule in pair)
     touches = clearance < TOUCHING
     if contacts is not None:
         touches = clearance < 0
@@ -134,7 +141,7 @@ def certify(
             elif least[frame] < _AT_RANGE:
                 cause = f"hand not reached: {learner.joint_names[int(margins[frame].argmin())]} is at its range"
         causes[frame] = cause
-    return Certificate(position, rotation, least, fastest, clearance, tuple(causes))
+    return Certificate(position, rotation, least, fastest, clearance, tuple(causes), nearest)
 
 
 def hand_errors(

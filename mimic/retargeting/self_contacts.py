@@ -49,7 +49,7 @@ class SelfContacts:
 
     def __init__(self, arm: Embodiment, capsules: Capsules):
         self._joints = arm.num_joints
-        self._names = ["the base" if joint < 0 else f"the link of {arm.joint_names[joint]}" for joint in capsules.joint]
+        self._names = capsules.links(arm)
         pairs = colliding_pairs(arm, capsules)
         self._minimum = APART * float(arm.chain_length)
         constants = clearance_constants(arm, capsules, pairs=pairs)

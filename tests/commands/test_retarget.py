@@ -118,6 +118,17 @@ def test_an_episode_of_which_few_frames_fail_is_searched_again(monkeypatch, fail
     assert sum(map(bool, certificate.causes)) == failing[chosen]
 
 
+def test_a_negative_clearance_is_explained():
+    none, names = np.zeros(2), {"far": 0.03, "near": -0.0091, "nearer not": -0.004, "unknown": np.nan}
+    certificates = {
+        name: Certificate(none, none, none, none, np.array([0.1, value]), ("", ""), "the base and the link of b")
+        for name, value in names.items()
+    }
+    (line,) = retarget._overlap_lines(certificates)
+    assert line.startswith("clearance below 0: capsules around the base and the link of b overlap, by 9 mm in near; ")
+    assert not retarget._overlap_lines({"far": certificates["far"], "unknown": certificates["unknown"]})
+
+
 def test_advice_is_what_a_user_can_set():
     none = np.zeros(3)  # all hands are at their places: their rotations are wrong
     certificate = Certificate(none, none + 1, none, none, none, ("hand out of reach",) * 3)

@@ -83,3 +83,4 @@ def test_touching_links_fail():
     arm, folded = dataclasses.replace(ARM, joint_range=np.array([[-4.0, 4.0]] * 7)), np.tile(FOLDED, (20, 1))
     certificate = certify(arm, arm, folded, folded, JUMP, capsules=capsules)
     assert np.all(certificate.clearance < 0) and set(certificate.causes) == {"links touch"}
+    assert certificate.nearest == "the link of joint1 and the link of joint7"
