@@ -34,6 +34,7 @@ AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
 ITERATIONS = 16
 STARTS = {"free": 12, "exact": 35}
+_LARGEST_ANGLE = 1e4  # rad; float32 resolves 0.001 rad there, and less beyond
 FLAT = 1e-3  # gradient [1/rad] of a converged pose, as a fraction of the mean distance of random poses
 
 
@@ -116,7 +117,7 @@ def imitate_pose(
       capsules: of the learner, from `fit_capsules`, for the costs of collisions.
 
     Raises:
-      ValueError: poses of the wrong shape or not finite, or a count below its minimum.
+      ValueError: poses of the wrong shape, not finite or above 10,000 rad, or a count below its minimum.
     """
     poses = checked_poses(expert, _concrete(qpos))
     # Longer than 40 lines: argument checks, and functions that share the arguments.
@@ -341,7 +342,7 @@ def checked_poses(
       axes: names of the required axes before that of the joints.
 
     Raises:
-      ValueError: the shape is not [..., *axes, joints], there is no pose, or an angle is not finite.
+      ValueError: the shape is not [..., *axes, joints], there is no pose, or an angle is no number up to 10,000 rad.
     """
     if poses.ndim <= len(axes) or poses.shape[-1] != arm.num_joints:
         shape = ", ".join(["...", *axes, str(arm.num_joints)])
@@ -349,6 +350,7 @@ def checked_poses(
     if not poses.size:
         raise ValueError(f"{name}: expected one pose or more, got shape {poses.shape}")
     poses = poses if jnp.issubdtype(poses.dtype, jnp.floating) else poses.astype(float)
-    if not isinstance(poses, Tracer) and not np.all(np.isfinite(np.asarray(poses))):
-        raise ValueError(f"{name}: expected finite angles [rad], got some that are not")
+    if not isinstance(poses, Tracer) and not np.all(np.abs(values := np.asarray(poses)) <= _LARGEST_ANGLE):
+        worst = values[~(np.abs(values) <= _LARGEST_ANGLE)][0]
+        raise ValueError(f"{name}: expected finite angles of at most {_LARGEST_ANGLE:,g} rad, got {worst:g}")
     return poses

@@ -171,7 +171,8 @@ def test_trajectories_do_not_jump(metric, limits):
     ("qpos", "options", "message"),
     [
         (np.zeros(6), {}, r"qpos: expected shape \[..., 7\] for planar7, got \(6,\)"),
-        (np.full(7, np.nan), {}, "qpos: expected finite angles"),
+        (np.full(7, np.nan), {}, "qpos: expected finite angles of at most 10,000 rad, got nan"),
+        (np.array([0, 0, -1e30, 0, 0, 0, 0]), {}, "qpos: expected finite angles of at most 10,000 rad, got -1e\\+30"),
         (np.zeros((0, 7)), {}, "qpos: expected one pose or more"),
         (np.zeros(7), {"starts": -1}, "starts, iterations"),
         (np.zeros(7), {"hand": "near"}, "hand: expected one of free, exact, got 'near'"),
