@@ -176,7 +176,7 @@ class ImitationEnv(Env):
 
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> ArmState:
         """The first state of an episode; the demonstration is random where None."""
-        key_demonstration, _, key_next = jax.random.split(key, 3)
+        key_demonstration, key_next = jax.random.split(key)
         if demonstration is None:
             demonstration = jax.random.randint(key_demonstration, (), 0, self.demonstrations.count)
         demonstration = jnp.asarray(demonstration, jnp.int32)

@@ -20,6 +20,14 @@ def planar_env():
     return mimic.make("planar4dof", **SHORT_ARMS, demonstrations=FEW)
 
 
+def test_an_episode_draws_its_demonstration_and_the_next_key_of_two_parts(planar_env):
+    key = jax.random.PRNGKey(3)
+    key_demonstration, key_next = jax.random.split(key)
+    state = planar_env.start(key)
+    assert state.key.tolist() == key_next.tolist()
+    assert state.demonstration == jax.random.randint(key_demonstration, (), 0, planar_env.demonstrations.count)
+
+
 OF_MANY_ARMS = ("any_arm", "panda_family")
 QUICK = ("planar4dof", "panda3dof")
 
