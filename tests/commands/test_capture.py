@@ -10,7 +10,7 @@ from mimic.commands.capture import body_lines, prepare_capture_inspection, read_
 from mimic.commands.config import CaptureConfig
 from mimic.motions.mocap.clips import slow_down_for
 from mimic.motions.mocap.link_motion import arm_motion
-from tests.helpers.bodies import bvh_text, person
+from tests.helpers.bodies import bvh_text, person, write_npz
 from tests.helpers.commands import compose, run
 
 
@@ -57,16 +57,10 @@ def test_demonstrations_fit_the_arm_that_is_written_with_them(written):
     assert (folder / "left.png").stat().st_size > 10_000
 
 
-@pytest.fixture(scope="module")
-def both(long_clip):
-    """Demonstrations of both arms, and what the command printed."""
-    arguments = f"source={long_clip}", "arm=both", "out=both.npz", "env=bimanual"
-    return long_clip.parent, run("demonstrations", *arguments, folder=long_clip.parent)
-
-
 @pytest.mark.slow
-def test_demonstrations_of_both_arms_fit_the_bimanual_environment(both):
-    folder, printed = both
+def test_demonstrations_of_both_arms_fit_the_bimanual_environment(long_clip):
+    arguments, folder = (f"source={long_clip}", "arm=both", "out=both.npz", "env=bimanual"), long_clip.parent
+    printed = run("demonstrations", *arguments, folder=folder)
     env = mimic.env_config("bimanual", expert={"model": str(folder / "both.xml")})
     expert, learner = env.build_arms().embodiments
     mimic.load_demonstrations(folder / "both.npz").check_fits(expert, 0.1, 50)
@@ -82,14 +76,14 @@ def test_a_gap_in_the_other_arm_splits_nothing(tmp_path):
     body = person(300)
     positions = body.positions.copy()
     positions[100:200, body.names.index("LeftHand")] = np.nan
-    np.savez(tmp_path / "clip.npz", names=np.array(body.names), positions=positions, rate=body.rate)
+    write_npz(tmp_path / "clip.npz", body.names, positions)
     capture = read_arm(tmp_path / "clip.npz", "right", CaptureConfig())
     assert [len(part.start) for part in capture.parts] == [300] and capture.starts == [0.0]
     capture = read_arm(tmp_path / "clip.npz", "left", CaptureConfig())
     assert [len(part.start) for part in capture.parts] == [100, 100]
     assert capture.starts == pytest.approx([0.0, 200 / body.rate]) and capture.bridged == 0
     positions[100:194] = body.positions[100:194]  # 0.1 s remain
-    np.savez(tmp_path / "short.npz", names=np.array(body.names), positions=positions, rate=body.rate)
+    write_npz(tmp_path / "short.npz", body.names, positions)
     capture = read_arm(tmp_path / "short.npz", "left", CaptureConfig())
     assert [len(part.start) for part in capture.parts] == [300] and capture.bridged == 1
 
@@ -133,7 +127,7 @@ def test_what_is_unusual_about_arms_is_named(tmp_path):
     positions = body.positions.copy()
     hand, elbow = (positions[:, body.names.index(name)] for name in ("RightHand", "RightForeArm"))
     hand[:] = elbow + 0.4 * (hand - elbow)
-    np.savez(tmp_path / "clip.npz", names=np.array(body.names), positions=positions, rate=body.rate, unit=np.array("m"))
+    write_npz(tmp_path / "clip.npz", body.names, positions, unit=np.array("m"))
     lines = body_lines(read_body(tmp_path / "clip.npz", CaptureConfig()))
     assert any(line.startswith("right arm: an upper arm of 0.28 m and a forearm of 0.10 m") for line in lines)
     assert any(line.startswith("arms of 0.53 m (left) and 0.38 m (right)") for line in lines)
@@ -172,7 +166,7 @@ def test_the_model_of_the_arm_is_not_overwritten(reason, clip, tmp_path):
 
 def test_points_of_a_person_without_an_arm_are_a_question(reason, tmp_path):
     body = person(20)
-    np.savez(tmp_path / "points.npz", names=np.array(body.names), positions=body.positions, rate=body.rate)
+    write_npz(tmp_path / "points.npz", body.names, body.positions)
     assert "expected arm=left, right or both" in reason(
         "demonstrations", f"source={tmp_path}/points.npz", "out=new.npz"
     )

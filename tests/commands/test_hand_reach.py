@@ -23,15 +23,10 @@ def arm(tmp_path_factory):
     return mimic.build_arm(mimic.ArmConfig(model=str(file)), "hardware")
 
 
-@pytest.fixture
-def poses(arm):
-    lower, upper = arm.embodiment.joint_range.T
-    return np.random.default_rng(2).uniform(lower, upper, (20, 6))
-
-
-def test_the_speed_that_is_kept_is_the_ratio_of_the_limits(arm, poses):
+def test_the_speed_that_is_kept_is_the_ratio_of_the_limits(arm):
     """An arm keeps its own speed; with a third of the limits a third of it, whatever the yaw of its base."""
-    expert, exact = arm.embodiment, np.ones(len(poses), bool)
+    expert, exact = arm.embodiment, np.ones(20, bool)
+    poses = np.random.default_rng(2).uniform(*expert.joint_range.T, (20, 6))
     learner = dataclasses.replace(expert, velocity_limit=np.full(6, np.pi / 3))
     expert = dataclasses.replace(expert, velocity_limit=np.full(6, np.pi))
     in_place, turned_base = (repeated(np.array([[0, 0, 0, yaw]]), len(poses)) for yaw in (0.0, 1.1))

@@ -77,15 +77,10 @@ def evaluator(config, motions):
     return Evaluator(mimic.ImitationEnv(dataclasses.replace(config, arms=None), motions[0]), motions[1])
 
 
-@pytest.fixture(scope="module")
-def of_one_arm(evaluator):
-    return run_controller(evaluator, "nearest_pose")[0]
-
-
 @pytest.mark.slow
-def test_the_controller_is_near_the_kinematic_bound(evaluator, of_one_arm):
+def test_the_controller_is_near_the_kinematic_bound(evaluator):
     """Measured: 0.6 and 1.2 % in the first two seconds; in whole episodes of the default demonstrations less."""
-    gap = evaluator.summary(of_one_arm)["optimality_gap"]
+    gap = evaluator.summary(run_controller(evaluator, "nearest_pose")[0])["optimality_gap"]
     assert -0.001 < gap["train"] < 0.02 and -0.001 < gap["held_out"] < 0.02
 
 

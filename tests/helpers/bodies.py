@@ -1,6 +1,11 @@
-"""A person whose arms move, as points and as a BVH file; generated, so that all is known."""
+"""A person whose arms move, as points and as files of motion capture; generated, so that all is known."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
 from mimic.motions.mocap.points import PointMotion
 
@@ -90,3 +95,42 @@ def person(samples: int = 600) -> PointMotion:
     """The person's joints, as a reader gives them."""
     names, parents, _ = zip(*JOINTS, strict=True)
     return PointMotion(names, parents, positions(samples), RATE)
+
+
+def write_npz(path: Path, names: Sequence[str], positions: np.ndarray, **content: Any) -> Path:
+    """Writes points at the rate of the person, or at the times or the rate in `content`."""
+    rate = {} if "time" in content else {"rate": RATE}
+    np.savez(path, names=np.array(names), positions=positions, **{**rate, **content})
+    return path
+
+
+def write_trc(
+    path: Path, motion: PointMotion, *, time: np.ndarray | None = None, rate: float = RATE, separator: str = "\t"
+) -> Path:
+    """Writes a TRC file in mm; points that were not seen are empty."""
+    order = [1, 2, 0]  # y up
+    time = np.arange(len(motion.positions)) / motion.rate if time is None else time
+    lines = [
+        ["PathFileType", "4", "(X/Y/Z)", path.name],
+        ["DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units"],
+        [f"{rate}", f"{rate}", f"{len(time)}", f"{len(motion.names)}", "mm"],
+        ["Frame#", "Time", *(cell for name in motion.names for cell in (name, "", ""))],
+        [""] * (2 + 3 * len(motion.names)),
+    ]
+    for i, row in enumerate(1000 * motion.positions[..., order].reshape(len(time), -1)):
+        lines.append([str(i + 1), f"{time[i]:.10g}", *("" if np.isnan(value) else f"{value:.6f}" for value in row)])
+    path.write_text("\n".join(map(separator.join, lines)))
+    return path
+
+
+def write_c3d(path: Path, points: np.ndarray, **labels: list[str]) -> Path:
+    """Writes points [samples, points, 3] [mm] as C3D, with lists of words of the group POINT."""
+    ezc3d = pytest.importorskip("ezc3d", reason="the extra [mocap] is not installed")
+    file = ezc3d.c3d()
+    for key, value in {"UNITS": ["mm"], **labels}.items():
+        file.add_parameter("POINT", key, value)
+    file["parameters"]["POINT"]["RATE"]["value"] = [RATE]
+    file["data"]["points"] = np.ones((4, points.shape[1], len(points)))
+    file["data"]["points"][:3] = points.transpose(2, 1, 0)
+    file.write(str(path))
+    return path

@@ -56,21 +56,10 @@ def write_captures(folder: Path) -> None:
     (folder / "clip.bvh").write_text(bodies.bvh_text(12))
     header = ",".join(["time", *(f"{name}_{axis}" for name in body.names for axis in "xyz")])
     np.savetxt(folder / "clip.csv", np.column_stack([time_, positions]), "%.6f", ",", header=header, comments="")
-    arrays = {"names": np.array(body.names), "positions": body.positions, "rate": np.array(bodies.RATE)}
-    np.savez(folder / "clip.npz", **arrays)  # type: ignore[arg-type]
-    keys = "DataRate\tNumMarkers\tUnits", f"{bodies.RATE}\t{len(body.names)}\tmm"
-    lines = ["PathFileType\t4", *keys, "Frame#\tTime\t" + "\t\t\t".join(body.names), ""]
-    lines += ["\t".join(f"{x:.4f}" for x in (i, time_[i], *1000 * positions[i])) for i in range(12)]
-    (folder / "clip.trc").write_text("\n".join(lines))
+    bodies.write_npz(folder / "clip.npz", body.names, body.positions)
+    bodies.write_trc(folder / "clip.trc", body)
     if importlib.util.find_spec("ezc3d"):
-        import ezc3d
-
-        file, points = ezc3d.c3d(), np.ones((4, len(body.names), 12))
-        points[:3] = np.moveaxis(1000 * body.positions, -1, 0).swapaxes(1, 2)
-        for name, value in (("RATE", [bodies.RATE]), ("LABELS", list(body.names)), ("UNITS", ["mm"])):
-            file["parameters"]["POINT"][name]["value"] = value
-        file["data"]["points"] = points
-        file.write(str(folder / "clip.c3d"))
+        bodies.write_c3d(folder / "clip.c3d", 1000 * body.positions, LABELS=list(body.names))
 
 
 def write_runs(folder: Path) -> None:

@@ -24,10 +24,6 @@ def random_poses(joints, seed):
     return np.random.default_rng(seed).uniform(-2, 2, (TIMES, joints)).astype(np.float32)
 
 
-def wide(qpos):
-    return np.stack([padded(row) for row in qpos]).astype(np.float32)
-
-
 def cases():
     """Arrays, their poses [T, 8], the embodiment and its poses; the Panda's locked variants and planar arms."""
     result = []
@@ -41,7 +37,7 @@ def cases():
     for lengths in ([0.5, 0.3], [0.1, 0.4, 0.35, 0.25, 0.2]):
         arm = build_arm(ArmConfig(model="planar", link_lengths=lengths))
         own = random_poses(len(lengths), len(lengths))
-        result.append((arm_arrays(arm), wide(own), arm.embodiment, own))
+        result.append((arm_arrays(arm), np.stack([padded(row) for row in own]), arm.embodiment, own))
     return result
 
 

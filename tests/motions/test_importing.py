@@ -1,10 +1,15 @@
 """Imported motions: tables and files of LocoMuJoCo become demonstrations or are rejected in one line."""
 
+import sys
+
 import numpy as np
 import pytest
 
 import mimic
 from mimic.motions.formats.archives import read_archive
+from mimic.motions.formats.hdf5 import read_hdf5
+from mimic.motions.formats.lerobot_reading import read_lerobot
+from mimic.motions.formats.rosbag2 import read_rosbag2
 from tests.helpers.commands import run
 
 TIME = np.arange(0, 6.0, 0.02)  # s
@@ -176,3 +181,12 @@ def test_bad_tables(reason, tmp_path, make, arguments, message):
 def test_bad_archives(reason, tmp_path, changes, message):
     path = archive(tmp_path / "motion.npz", **changes)
     assert message in reason("demonstrations", f"source={path}", "out=new.npz")
+
+
+@pytest.mark.parametrize(
+    ("package", "read"), [("h5py", read_hdf5), ("pyarrow", read_lerobot), ("rosbags", read_rosbag2)]
+)
+def test_a_missing_package_is_named(package, read, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ValueError, match=rf"needs the package {package}: pip install 'mimic-arms\[datasets\]'"):
+        read(tmp_path, NUMBERED)

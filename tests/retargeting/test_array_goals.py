@@ -27,13 +27,9 @@ def distinct(poses):
 
 
 @pytest.fixture(scope="module")
-def panda():
-    return jax.tree.map(jnp.asarray, arm_arrays(build_arm(ArmConfig())).astype(np.float32))
-
-
-@pytest.fixture(scope="module")
-def problem(panda):
+def problem():
     """A 4-joint Panda and an expert in a pose that this arm can take."""
+    panda = jax.tree.map(jnp.asarray, arm_arrays(build_arm(ArmConfig())).astype(np.float32))
     expert = link_states(panda, jnp.array([0.6, 0.7, 0.0, -1.3, 0.9, 0.0, 0.0, 0.0]))
     learner = lock_joints(panda, ELBOW)
     return Problem(learner, WEIGHTS, arc_length_correspondence(panda, learner), expert, 0.1)

@@ -11,13 +11,9 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.control.clearance import clearance
 from mimic.metric.capsule_distances import capsule_axes, changing_pairs, clearance_constants, pair_distances
+from tests.helpers.metric_cases import random_poses
 
 CONFIGS = {"locked": ArmConfig(locked=[3, 6, 7]), "two arms": ArmConfig(model="panda_pair")}
-
-
-def poses(arm, count=500, seed=0):
-    lower, upper = np.asarray(arm.joint_range).T
-    return np.random.default_rng(seed).uniform(lower, upper, (count, arm.num_joints)).astype(np.float32)
 
 
 @pytest.mark.slow_for("two arms")
@@ -31,7 +27,7 @@ def test_it_is_the_distance_of_the_costs(config):
         height = jnp.minimum(start[moves, 2], end[moves, 2]) - capsules.radius[moves].astype(np.float32)
         return jnp.minimum(pair_distances(capsules, start, end)[np.flatnonzero(is_changing)].min(), height.min())
 
-    qpos = poses(arm)
+    qpos = random_poses(arm, 500)
     actual = clearance(qpos, clearance_constants(arm, capsules))
     assert np.ptp(actual) > 0.1 and actual.dtype == np.float32
     # The costs smooth distances by 0.1 mm where axes cross; there is none otherwise.

@@ -62,11 +62,8 @@ def distance_of(learner: Embodiment, pose: np.ndarray, qpos: np.ndarray) -> np.n
     """The metric in the axes of the learner's base: planar directions turn by the yaw, which joint 1 does too."""
     metric = MetricConfig().build(EXPERT, learner)
     states = link_states(EXPERT, jnp.asarray(pose - np.array([BASE[3], 0, 0], np.float32)))
-    return np.asarray(embodiment_distance(states, link_states(learner, jnp.asarray(qpos)), *metric_parts(metric)))
-
-
-def metric_parts(metric):
-    return metric.correspondence, metric.weights
+    own = link_states(learner, jnp.asarray(qpos))
+    return np.asarray(embodiment_distance(states, own, metric.correspondence, metric.weights))
 
 
 def test_a_planar_arm_takes_the_better_of_its_two_closed_form_postures():

@@ -1,7 +1,6 @@
 """LeRobot datasets as a source of motions: mimic's own, those of others, and damaged ones."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -157,9 +156,3 @@ def test_several_features_with_the_joints_are_a_question(tmp_path):
     with pytest.raises(ValueError, match=r"topic: expected a feature .*; got 'observation.image'"):
         read_lerobot(tmp_path, EXPERT, "observation.image")
     assert len(read_lerobot(tmp_path, EXPERT, "observation.state").motions) == 3
-
-
-def test_a_missing_package_is_named(written, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(ValueError, match=r"needs the package pyarrow: pip install 'mimic-arms\[datasets\]'"):
-        read_lerobot(written, EXPERT)

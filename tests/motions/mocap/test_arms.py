@@ -16,14 +16,13 @@ def body():
     return person(10)
 
 
-def _place(body, name):
-    """Position of a joint, or between two of them: 'LeftArm+LeftForeArm'."""
-    return np.mean([body.point(joint) for joint in name.split("+")], axis=0)
-
-
 def _motion(body, points, parents=None):
-    """A motion of points at joints of the person: {name: joint}, where a list of parents makes a skeleton of them."""
-    positions = np.stack([_place(body, joint) for joint in points.values()], axis=1)
+    """A motion of points at joints of the person, or between two: {name: "LeftArm+LeftForeArm"}.
+
+    A list of parents makes a skeleton of them.
+    """
+    places = [np.mean([body.point(joint) for joint in name.split("+")], axis=0) for name in points.values()]
+    positions = np.stack(places, axis=1)
     return PointMotion(tuple(points), parents or (-1,) * len(points), positions, RATE)
 
 

@@ -10,7 +10,7 @@ from mimic.motions.mocap.arms import find_arms
 from mimic.motions.mocap.conventions import UNITS, UPS, z_up
 from mimic.motions.mocap.points import ArmPoints, PointMotion
 from mimic.motions.mocap.reading import read_motion
-from tests.helpers.bodies import RATE, bvh_text, person
+from tests.helpers.bodies import RATE, bvh_text, person, write_c3d, write_npz, write_trc
 
 SAMPLES = 80
 ARM = ("LeftArm", "LeftForeArm", "LeftHand", "LeftHandMiddle1")
@@ -25,13 +25,6 @@ def _bvh(tmp_path, text, name="clip.bvh"):
     path = tmp_path / name
     path.write_text(text)
     return path
-
-
-def _npz(tmp_path, positions, names, **content):
-    """Writes points at the rate of the person, or at the times or the rate in `content`."""
-    rate = {} if "time" in content else {"rate": RATE}
-    np.savez(tmp_path / "p.npz", names=np.array(names), positions=positions, **{**rate, **content})
-    return tmp_path / "p.npz"
 
 
 def _assert_person(motion, expected):
@@ -76,7 +69,7 @@ def test_up_is_found_from_the_body(tmp_path, expected, up):
     assert np.linalg.det(turned) == pytest.approx(1)
     sign = -1 if up.startswith("-") else 1
     np.testing.assert_array_equal(turned["xyz".index(up[-1])] * sign, [0, 0, 1])
-    motion = read_motion(_npz(tmp_path, expected.positions @ turned.T, expected.names))  # undoes z_up
+    motion = read_motion(write_npz(tmp_path / "p.npz", expected.names, expected.positions @ turned.T))  # undoes z_up
     guess = "" if up in ("y", "z", "-y") else ": a guess, capture.up= sets it"
     assert f"up: {up}, from the feet to the head{guess}" in motion.notes
     np.testing.assert_allclose(motion.positions, expected.positions, atol=1e-9)
@@ -101,7 +94,7 @@ def test_trc(tmp_path, expected):
     tracks = [expected.point(ARM[0]), expected.point(ARM[1]), wrist + 0.02, wrist - 0.02, expected.point(ARM[3])]
     written = PointMotion(names, (-1,) * 5, np.stack(tracks, axis=1), RATE)
     written.positions[3, 0] = np.nan
-    motion = read_motion(_trc(tmp_path / "clip.trc", written, separator=","))
+    motion = read_motion(write_trc(tmp_path / "clip.trc", written, separator=","))
     np.testing.assert_allclose(motion.positions, written.positions, atol=1e-6)
     arm = find_arms(motion)["left"]
     assert (arm.shoulder, arm.elbow, arm.wrist, arm.hand) == (("LSHO",), ("LELB",), ("LWRA", "LWRB"), ("LFIN",))
@@ -117,7 +110,7 @@ def test_trc(tmp_path, expected):
     ],
 )
 def test_a_stated_unit_is_checked(tmp_path, expected, unit, message):
-    path = _npz(tmp_path, expected.positions, expected.names, unit=np.array(unit))
+    path = write_npz(tmp_path / "p.npz", expected.names, expected.positions, unit=np.array(unit))
     if message is None:
         return _assert_person(read_motion(path), expected)
     with pytest.raises(ValueError, match=message):
@@ -137,7 +130,7 @@ def test_a_length_of_two_units_is_not_guessed(tmp_path, expected):
 def test_uneven_times_are_resampled(tmp_path, expected):
     time = np.arange(SAMPLES) / RATE
     keep = np.delete(np.arange(SAMPLES), [20])
-    motion = read_motion(_npz(tmp_path, expected.positions[keep], expected.names, time=time[keep]))
+    motion = read_motion(write_npz(tmp_path / "p.npz", expected.names, expected.positions[keep], time=time[keep]))
     assert len(motion.positions) == SAMPLES and np.isnan(motion.positions[20]).all()
     known = np.isfinite(motion.positions).all(axis=(1, 2))
     assert known.sum() >= SAMPLES - 2
@@ -146,7 +139,7 @@ def test_uneven_times_are_resampled(tmp_path, expected):
 
 
 def test_a_trc_file_that_is_cut_off_is_a_note(tmp_path, expected):
-    path = _trc(tmp_path / "clip.trc", _markers(expected, MARKERS))
+    path = write_trc(tmp_path / "clip.trc", _markers(expected, MARKERS))
     path.write_text("\n".join(path.read_text().splitlines()[:-10]))
     assert f"the header states {SAMPLES} frames, the file has {SAMPLES - 10}" in read_motion(path).notes
 
@@ -213,23 +206,6 @@ def test_a_damaged_c3d_cannot_end_the_process(tmp_path):
             read_motion(tmp_path / "bad.c3d")
 
 
-def _trc(path, motion, *, time=None, rate=RATE, separator="\t"):
-    """Writes a TRC file in mm; points that were not seen are empty."""
-    order = [1, 2, 0]  # y up
-    time = np.arange(len(motion.positions)) / motion.rate if time is None else time
-    lines = [
-        ["PathFileType", "4", "(X/Y/Z)", path.name],
-        ["DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units"],
-        [f"{rate}", f"{rate}", f"{len(time)}", f"{len(motion.names)}", "mm"],
-        ["Frame#", "Time", *(cell for name in motion.names for cell in (name, "", ""))],
-        [""] * (2 + 3 * len(motion.names)),
-    ]
-    for i, row in enumerate(1000 * motion.positions[..., order].reshape(len(time), -1)):
-        lines.append([str(i + 1), f"{time[i]:.10g}", *("" if np.isnan(value) else f"{value:.6f}" for value in row)])
-    path.write_text("\n".join(map(separator.join, lines)))
-    return path
-
-
 def _markers(expected, names):
     """Some joints of the person, under the names of markers."""
     chosen = expected.select(list(names))
@@ -247,7 +223,7 @@ def test_placeholders_of_what_was_not_seen_are_no_positions(tmp_path, expected, 
     markers = _markers(expected, MARKERS)
     positions = markers.positions.copy()
     positions[20:60, markers.names.index("RWRI")] = value / 1000
-    motion = read_motion(_trc(tmp_path / "clip.trc", dataclasses.replace(markers, positions=positions)))
+    motion = read_motion(write_trc(tmp_path / "clip.trc", dataclasses.replace(markers, positions=positions)))
     assert np.isnan(motion.point("RWRI")[20:60]).all() and np.isfinite(motion.point("RWRI")[:20]).all()
     assert f"not seen: 40 positions whose three coordinates are equal ({value:g})" in motion.notes
 
@@ -255,18 +231,18 @@ def test_placeholders_of_what_was_not_seen_are_no_positions(tmp_path, expected, 
 @pytest.mark.parametrize(("digits", "rate"), [(2, 59.94), (3, 60.0)])
 def test_rounded_times_are_those_of_the_stated_rate(tmp_path, expected, digits, rate):
     time = np.round(np.arange(SAMPLES) / rate, digits)
-    motion = read_motion(_trc(tmp_path / "clip.trc", _markers(expected, MARKERS), time=time, rate=rate))
+    motion = read_motion(write_trc(tmp_path / "clip.trc", _markers(expected, MARKERS), time=time, rate=rate))
     assert motion.rate == rate and len(motion.positions) == SAMPLES
     time[40:] += 0.1  # a gap is one, whatever the header states
     if digits == 3:
-        gap = read_motion(_trc(tmp_path / "gap.trc", _markers(expected, MARKERS), time=time, rate=rate))
+        gap = read_motion(write_trc(tmp_path / "gap.trc", _markers(expected, MARKERS), time=time, rate=rate))
         assert np.isnan(gap.point("RWRI")).any() and "resampled" in " ".join(gap.notes)
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e9, "nanoseconds")])
 def test_times_in_smaller_units(tmp_path, expected, factor, unit):
     time = np.arange(SAMPLES) / RATE * factor + 1e6 * factor
-    motion = read_motion(_npz(tmp_path, expected.positions, expected.names, time=time))
+    motion = read_motion(write_npz(tmp_path / "p.npz", expected.names, expected.positions, time=time))
     assert motion.rate == pytest.approx(RATE, rel=1e-6) and f"time: taken for {unit}" in motion.notes
 
 
@@ -280,7 +256,7 @@ def test_a_person_who_stands_on_the_hands_is_not_turned(tmp_path):
 
 def test_a_person_who_leans_far_is_a_guess(tmp_path, expected):
     leaning = Rotation.from_euler("x", 50, degrees=True).as_matrix()
-    motion = read_motion(_npz(tmp_path, expected.positions @ leaning.T, expected.names))
+    motion = read_motion(write_npz(tmp_path / "p.npz", expected.names, expected.positions @ leaning.T))
     (note,) = (note for note in motion.notes if note.startswith("up: "))
     assert note.endswith("a guess, capture.up= sets it")
 
@@ -289,7 +265,7 @@ def test_markers_that_stand_still_while_the_arm_moves_are_left_out(tmp_path, exp
     motion = _markers(expected, MARKERS)
     wrist = motion.index(find_arms(motion)["left"].wrist[0])
     motion.positions[10:40, wrist] = motion.positions[10, wrist]
-    found = read_motion(_trc(tmp_path / "clip.trc", motion))
+    found = read_motion(write_trc(tmp_path / "clip.trc", motion))
     assert np.isnan(found.positions[11:40, wrist]).all() and np.isfinite(found.positions[:11]).all()
     assert "left out: 29 samples at which a marker stands still while the arm moves" in found.notes
 
@@ -298,7 +274,7 @@ def test_exchanged_markers_are_left_out(tmp_path, expected):
     elbow, wrist = expected.names.index("LeftForeArm"), expected.names.index("LeftHand")
     positions = expected.positions.copy()
     positions[20:30, [elbow, wrist]] = positions[20:30, [wrist, elbow]]
-    motion = read_motion(_npz(tmp_path, positions, expected.names))
+    motion = read_motion(write_npz(tmp_path / "p.npz", expected.names, positions))
     assert any(note.startswith("left out: 10 samples at which an arm's length") for note in motion.notes)
     assert np.isnan(motion.positions[20:30, elbow]).all()
     np.testing.assert_allclose(np.delete(motion.point("LeftHand"), range(20, 30), axis=0),
@@ -311,7 +287,7 @@ def test_up_of_markers_that_were_seen(tmp_path, expected):
     markers = _markers(expected, names)
     positions = markers.positions.copy()
     positions[:, markers.names.index("LFHD")] = np.nan
-    motion = read_motion(_trc(tmp_path / "clip.trc", dataclasses.replace(markers, positions=positions)))
+    motion = read_motion(write_trc(tmp_path / "clip.trc", dataclasses.replace(markers, positions=positions)))
     assert motion.notes == ("up: y, from the hips to the neck",)
 
 
@@ -323,7 +299,7 @@ def test_up_of_markers_that_were_seen(tmp_path, expected):
     ],
 )
 def test_up_that_the_file_states_where_the_body_shows_none(tmp_path, expected, content, note):
-    motion = read_motion(_npz(tmp_path, expected.select(ARM).positions, ARM, **content))
+    motion = read_motion(write_npz(tmp_path / "p.npz", ARM, expected.select(ARM).positions, **content))
     assert any(line.startswith(note) for line in motion.notes)
 
 
@@ -332,7 +308,7 @@ def test_mirrored_points_are_named(tmp_path, expected, mirrored):
     feet = {side: expected.point(f"{side}Foot") + [0.15, 0, -0.04] for side in ("Left", "Right")}
     positions = np.concatenate([expected.positions, np.stack(list(feet.values()), axis=1)], axis=1)
     positions = positions * [1, -1 if mirrored else 1, 1]
-    motion = read_motion(_npz(tmp_path, positions, [*expected.names, "LeftToe", "RightToe"]))
+    motion = read_motion(write_npz(tmp_path / "p.npz", [*expected.names, "LeftToe", "RightToe"], positions))
     assert any("toes point backwards" in note for note in motion.notes) is mirrored
 
 
@@ -340,7 +316,7 @@ def test_one_of_several_persons_is_read(tmp_path, expected):
     markers = _markers(expected, MARKERS)
     names = tuple(f"{person}_{name}" for person in ("Ann", "Bob") for name in markers.names)
     positions = np.concatenate([markers.positions, markers.positions + [2, 0, 0]], axis=1)
-    path = _trc(tmp_path / "clip.trc", type(markers)(names, (-1,) * len(names), positions, RATE))
+    path = write_trc(tmp_path / "clip.trc", type(markers)(names, (-1,) * len(names), positions, RATE))
     motion = read_motion(path)
     assert "persons: ann, bob, of which ann is read (capture.subject=)" in motion.notes
     assert motion.names[0] == "Ann_LSHO"
@@ -355,14 +331,14 @@ def test_the_first_of_points_with_one_name_counts(tmp_path, expected):
         markers, names=(*markers.names, "RANK"), parents=(-1,) * 10,
         positions=np.concatenate([markers.positions, markers.positions[:, :1]], axis=1),
     )  # fmt: skip
-    motion = read_motion(_trc(tmp_path / "clip.trc", twice))
+    motion = read_motion(write_trc(tmp_path / "clip.trc", twice))
     np.testing.assert_allclose(motion.point("RANK"), expected.point("RightFoot"), atol=1e-6)
     assert "names that occur twice, of which the first point is read: RANK" in motion.notes
 
 
 def test_points_that_the_user_names(tmp_path, expected):
     names = {"RightArm": "p1", "RightForeArm": "p2", "RightHand": "p3", "Head": "p4"}
-    path = _trc(tmp_path / "clip.trc", _markers(expected, names))
+    path = write_trc(tmp_path / "clip.trc", _markers(expected, names))
     assert find_arms(read_motion(path)) == {}
     named = ArmPoints("right", ("p1",), ("p2",), ("p3",), ())
     assert find_arms(read_motion(path, arm=named)) == {"right": named}
@@ -372,24 +348,11 @@ def test_points_that_the_user_names(tmp_path, expected):
         read_motion(path, arm=ArmPoints("left", ("p9",), (), (), ()))
 
 
-def _c3d(path, points, **labels):
-    """Writes points [samples, points, 3] [mm] as C3D, with lists of words of the group POINT."""
-    ezc3d = pytest.importorskip("ezc3d", reason="the extra [mocap] is not installed")
-    file = ezc3d.c3d()
-    for key, value in {"UNITS": ["mm"], **labels}.items():
-        file.add_parameter("POINT", key, value)
-    file["parameters"]["POINT"]["RATE"]["value"] = [RATE]
-    file["data"]["points"] = np.ones((4, points.shape[1], len(points)))
-    file["data"]["points"][:3] = points.transpose(2, 1, 0)
-    file.write(str(path))
-    return read_motion(path)
-
-
 def test_c3d(tmp_path, expected):
     names = ["LSHO", "LELB", "LWRA", "LFIN"]
     tracks = np.stack([expected.point(name) for name in ARM], axis=1)
     tracks[5, 1] = np.nan
-    motion = _c3d(tmp_path / "clip.c3d", 1000 * tracks, LABELS=names)
+    motion = read_motion(write_c3d(tmp_path / "clip.c3d", 1000 * tracks, LABELS=names))
     assert motion.names == tuple(names) and motion.rate == RATE
     np.testing.assert_allclose(motion.positions, tracks, atol=1e-6)
     content = (tmp_path / "clip.c3d").read_bytes()
@@ -404,6 +367,6 @@ def test_c3d_with_many_labels_outputs_of_models_and_a_vertical(tmp_path, expecte
     points = np.random.default_rng(0).uniform(0, 900, (3, len(names), 3))
     points[:, 260:266] = 1000 * _markers(expected, MARKERS).positions[:3, :6]
     labels = {"LABELS": names[:255], "LABELS2": names[255:], "ANGLES": names[-1:], "Y_SCREEN": ["-Y"]}
-    motion = _c3d(tmp_path / "clip.c3d", points, **labels)
+    motion = read_motion(write_c3d(tmp_path / "clip.c3d", points, **labels))
     assert motion.names == tuple(names[:-1]) and motion.notes == ("up: y, as the file states",)
     assert set(find_arms(motion)) == {"left", "right"}
