@@ -57,7 +57,7 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
     else:
         arrays, _ = masked_arrays(config.learner, config.limits, config.metric.links)
     with jax.ensure_compile_time_eval():
-        expert_arm, arm = (_constants(x) for x in (arm_arrays(expert), arrays))
+        expert_arm, arm = (jax.tree.map(jnp.asarray, x.astype(np.float32)) for x in (arm_arrays(expert), arrays))
         matrix = np.asarray(arc_length_correspondence(expert_arm, arm))
         speed = max_speed(arm, config.limits)
     places = np.flatnonzero(arrays.is_free)  # of the environment's joints
@@ -83,10 +83,6 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
         return torque[places] / env.torque_scale, chosen_goal(goals)
 
     return ControllerWithMemory(start, act)
-
-
-def _constants(arm: Any) -> Any:
-    return jax.tree.map(jnp.asarray, arm.astype(np.float32))
 
 
 def _padded(values: Array, size: int) -> Array:

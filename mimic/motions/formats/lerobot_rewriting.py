@@ -260,7 +260,7 @@ def _copy_others(source: Path, out: Path, plan: _Plan) -> None:
         if not file.is_file() or parts[0] == DATA_FOLDER or path.exists() or str(Path(*parts)) in (INFO, STATS):
             continue
         if found := [old for old in plan.new_number if f"episode_{old:06d}" in (file.stem, file.parent.name)]:
-            path = Path(str(path).replace(f"episode_{found[0]:06d}", f"episode_{plan.new_number[found[0]]:06d}"))
+            path = Path(_renumbered(str(path), found[0], plan))
         elif "episode_" in file.name or file.parent.name.startswith("episode_"):
             continue  # of an episode that is left out
         path.parent.mkdir(parents=True, exist_ok=True)
