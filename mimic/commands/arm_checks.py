@@ -11,7 +11,15 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.arm import DEFAULT_VELOCITY_LIMIT, Arm, ArmConfig, arm_spec, torque_scale, with_minimum_armature
+from mimic.arms.arm import (
+    DEFAULT_VELOCITY_LIMIT,
+    Arm,
+    ArmConfig,
+    arm_spec,
+    finite_velocity_limit,
+    torque_scale,
+    with_minimum_armature,
+)
 from mimic.arms.embodiment import load_arm
 from mimic.envs.config import EnvConfig
 from mimic.metric.kinematics import link_state_table
@@ -24,6 +32,7 @@ _DEMONSTRATIONS, _EVERY = 2, 5  # two demonstrations, every fifth step: a rough 
 # Rotor inertias [kg m^2] tried in turn for a joint that exceeds the velocity bound; the Panda's joints have 0.1.
 # The damping is proportional, with the ratio of the Panda [1/s].
 _ARMATURES, _DAMPING_RATIO = (0.01, 0.03, 0.1, 0.3), 10.0
+_TORQUE_FRACTION = 0.5  # of a joint's torque limit, at most, that the first damping takes at its velocity limit
 _DIVERGED = 10.0  # multiple of the velocity bound at which a simulation stops early
 _SAFE_FRACTION = 0.8  # of the velocity bound, that random torques may reach
 
@@ -167,10 +176,16 @@ def stabilised(config: ArmConfig, arm: Arm, env: EnvConfig) -> tuple[ArmConfig, 
     speeds = random_torque_speeds(arm, env)
     limit, names = _SAFE_FRACTION * env.speed_bound, arm.embodiment.joint_names
     original, changed, levels = speeds.max(), config, np.zeros(len(names), int)
+    damping_torque = _DAMPING_RATIO * _ARMATURES[0] * finite_velocity_limit(arm.embodiment)
+    strength = np.minimum(1.0, _TORQUE_FRACTION * np.asarray(arm.embodiment.torque_limit) / damping_torque)
     armature: dict[str, float] = {}
     while (raised := (speeds >= limit) & (levels < len(_ARMATURES))).any():
         levels += raised
-        armature = {name: _ARMATURES[level - 1] for name, level in zip(names, levels.tolist(), strict=True) if level}
+        armature = {
+            name: float(f"{_ARMATURES[level - 1] * factor:.2g}")
+            for name, level, factor in zip(names, levels.tolist(), strength.tolist(), strict=True)
+            if level
+        }
         changed = _with_armature(config, arm, armature)
         speeds = random_torque_speeds(with_minimum_armature(arm, changed), env)
     if original < limit:

@@ -67,6 +67,24 @@ def test_joints_that_are_slow_enough_stay_as_they_are(tmp_path):
     assert arm_checks.stabilised(changed, mimic.build_arm(changed), env) == (changed, "")
 
 
+def test_a_weak_arm_keeps_its_speed_with_the_suggested_damping(tmp_path):
+    """Servos of 0.01 N m would creep at 0.1 rad/s against the damping of a large arm."""
+    file = tmp_path / "small.xml"
+    link = (
+        '<body pos="0 0 0.02"><joint name="{0}" axis="{1}"/><geom type="capsule" fromto="0 0 0 0 0 0.02" size="0.003"/>'
+    )
+    links = "".join(link.format(f"j{i}", "0 1 0" if i % 2 else "0 0 1") for i in range(4))
+    motors = "".join(f'<motor joint="j{i}" ctrlrange="-0.01 0.01" ctrllimited="true"/>' for i in range(4))
+    velocity = '<custom><numeric name="velocity_limit" data="2 2 2 2"/></custom>'
+    world = f"<worldbody>{links}{'</body>' * 4}</worldbody>"
+    file.write_text(f'<mujoco model="small">{world}<actuator>{motors}</actuator>{velocity}</mujoco>')
+    config = mimic.ArmConfig(model=str(file))
+    changed, _ = arm_checks.stabilised(config, mimic.build_arm(config), EnvConfig())
+    arm = mimic.build_arm(changed)
+    assert np.all(arm.embodiment.torque_limit == 0.01) and arm.model.dof_damping.max() > 0
+    assert np.all(arm.model.dof_damping * arm.embodiment.velocity_limit <= 0.5 * arm.embodiment.torque_limit + 1e-9)
+
+
 @pytest.mark.slow
 def test_an_equal_arm_reaches_the_poses_of_the_expert():
     said = run("inspect", "panda")
