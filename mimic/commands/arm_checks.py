@@ -21,6 +21,7 @@ from mimic.arms.arm import (
     with_minimum_armature,
 )
 from mimic.arms.embodiment import load_arm
+from mimic.arms.simulation_model import effective_inertia
 from mimic.envs.config import EnvConfig
 from mimic.metric.kinematics import link_state_table
 from mimic.motions.demonstrations import Demonstrations
@@ -34,6 +35,7 @@ _DEMONSTRATIONS, _EVERY = 2, 5  # two demonstrations, every fifth step: a rough 
 _ARMATURES, _DAMPING_RATIO = (0.01, 0.03, 0.1, 0.3), 10.0
 _TORQUE_FRACTION = 0.5  # of a joint's torque limit, at most, that the first damping takes at its velocity limit
 _DIVERGED = 10.0  # multiple of the velocity bound at which a simulation stops early
+_SLOWEST = 1.0  # s from rest to the velocity limit; the Panda's joints take up to 0.03, those of a UR5e 0.2
 _SAFE_FRACTION = 0.8  # of the velocity bound, that random torques may reach
 
 
@@ -156,6 +158,14 @@ def warnings(config: ArmConfig, arm: Arm) -> Iterator[str]:
     outside = names[(embodiment.home < lower) | (embodiment.home > upper)]
     if outside.size:
         yield f"{_listed(outside)}: the start pose is outside the joint range; limits=hardware starts inside it"
+    seconds = finite_velocity_limit(embodiment) * effective_inertia(arm.model, np.asarray(embodiment.home))
+    seconds /= np.asarray(embodiment.torque_limit)
+    weak = names[seconds > _SLOWEST]
+    if weak.size:
+        yield (
+            f"{_listed(weak)}: at the torque limit it takes {seconds.max():.3g} s to reach the velocity limit, too "
+            "long to imitate a motion; are masses in kg and torques in N m?"
+        )
     yield from hand_doubts("learner", arm)
 
 

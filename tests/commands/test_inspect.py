@@ -54,6 +54,19 @@ def test_armature_is_suggested_for_an_arm_that_runs_away(tmp_path):
     assert "wrist_3" in proposed and len(set(proposed.values())) > 1  # by joint
 
 
+@pytest.mark.parametrize(("mass", "is_weak"), [(2.0, False), (2000.0, True)])
+def test_an_arm_that_is_too_heavy_for_its_torques_is_noted(tmp_path, mass, is_weak):
+    """As of a file whose masses are in g."""
+    geom = f'<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="{mass}"/>'
+    link = f'<body pos="0.3 0 0"><joint name="{{}}" axis="0 0 1"/>{geom}'
+    motors = "".join(f'<motor joint="{name}" ctrlrange="-50 50" ctrllimited="true"/>' for name in "ab")
+    world = f"<worldbody>{link.format('a')}{link.format('b')}</body></body></worldbody>"
+    (file := tmp_path / "heavy.xml").write_text(f"<mujoco>{world}<actuator>{motors}</actuator></mujoco>")
+    config = mimic.ArmConfig(model=str(file))
+    said = [line for line in arm_checks.warnings(config, mimic.build_arm(config)) if "masses in kg" in line]
+    assert bool(said) == is_weak and all(": at the torque limit it takes " in line for line in said)
+
+
 def test_joints_that_are_slow_enough_stay_as_they_are(tmp_path):
     """A joint gets rotor inertia only if it exceeds the bound itself, and then no joint does."""
     file = tmp_path / "light.xml"
