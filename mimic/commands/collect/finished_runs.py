@@ -162,7 +162,7 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
     numbers = _numbers(report)
     missing = [key for split in SPLITS if (key := f"{metric.key}.{split}") not in numbers]
     if missing:
-        reason = f"diverged, without a meaningful gap, or of another version ({version})"
+        reason = f"{_other_version(version)}diverged, or without a meaningful gap"
         return LeftOut(name, f"{reason}: {REPORT} has no number {missing[0]}")
     try:
         settings = flatten(to_dict(config)) | _evaluation_settings(report, config.trainer.name, metric, numbers)
