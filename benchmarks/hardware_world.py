@@ -19,14 +19,15 @@ from typing import Any
 
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect
+from mimic.commands.config import ROBOT_LOOPS
 from mimic.evaluation.tracking_controllers import run_tracking
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import load_config
 
 COLUMNS = (
-    "run seed fused:.2% mjx:.2% virtual:.2% tracking:.2% lead late:.2% late_lead aborts contacts edges_worst:.2% "
-    "edges_together:.2%"
+    "run seed fused:.2% mjx:.2% virtual:.2% ruckig:.2% tracking:.2% lead late:.2% late_lead aborts contacts "
+    "edges_worst:.2% edges_together:.2%"
 )
 
 
@@ -40,7 +41,7 @@ def measure(run: Path, episodes: int, edge_episodes: int) -> Row:
     (tracking, lead), (late, late_lead) = (
         run_tracking(trainer.evaluator, is_delayed=is_delayed) for is_delayed in (False, True)
     )
-    (whole,) = _virtual(run, episodes).values()
+    loops = {loop: _virtual(run, episodes, f"robot_loop={loop}")["all ranges"] for loop in ROBOT_LOOPS}
     edges = _virtual(run, edge_episodes, "edges=true") if edge_episodes else {}
     single = {name: case["optimality_gap"] for name, case in edges.items() if not name.startswith("all")}
     together = [case["optimality_gap"] for name, case in edges.items() if name.startswith("all:")]
@@ -55,9 +56,11 @@ def measure(run: Path, episodes: int, edge_episodes: int) -> Row:
         "lead": lead,
         "late": trainer.metrics(late)["optimality_gap"]["held_out"],
         "late_lead": late_lead,
-        "virtual": whole["optimality_gap"],
-        "aborts": sum(whole["aborts"].values()),
-        "contacts": whole["self_contacts"],
+        "virtual": loops["mimic"]["optimality_gap"],
+        "ruckig": loops["ruckig"]["optimality_gap"],
+        "episodes": sum(cases["episodes"] for cases in loops.values()),
+        "aborts": sum(sum(cases["aborts"].values()) for cases in loops.values()),
+        "contacts": sum(cases["self_contacts"] for cases in loops.values()),
         **({"edges_worst": max(single.values()), "edges_together": max(together)} if edges else {}),
     }
 
