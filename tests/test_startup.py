@@ -10,7 +10,7 @@ import pytest
 from mimic.commands import cli
 
 HEAVY = {"brax", "mujoco.mjx", "orbax", "matplotlib", "tensorboardX", "mink", "optax", "scipy", "trimesh"}
-SHOWN = ("html", "live_session", "playback", "meshes", "tracking", "history", "captured")  # by the page of a view
+SHOWN = ("html", "live_session", "playback", "meshes", "tracking", "captured")  # by the page of a view
 STEPS = {
     "mimic": "import mimic",
     "help": """
