@@ -15,6 +15,7 @@ from mimic.arms.arrays import ArmArrays
 from mimic.arms.embodiment import LONG, Embodiment, in_chain_lengths
 from mimic.base import fused_kernel
 from mimic.base.batches import over_batch
+from mimic.base.compilation import by_value
 from mimic.metric import analytic_gradient
 from mimic.metric.distance import (
     PAPER_WEIGHTS,
@@ -131,8 +132,12 @@ def gradient_by_learner(
     return jnp.where(jnp.isfinite(gradient), gradient, 0)
 
 
+@by_value
 def _gradient_in_stages(learner: Embodiment, factors: np.ndarray) -> Callable[..., tuple[Array, ...]]:
-    """The gradient as a function of `_rows`, qpos and qvel; two kernels on a GPU: one compiles half as fast."""
+    """The gradient as a function of `_rows`, qpos and qvel; two kernels on a GPU: one compiles half as fast.
+
+    JAX traces the same function once for all callers, which takes seconds.
+    """
     by_states, by_motion = (
         functools.partial(stage, learner, factors)
         for stage in (analytic_gradient.gradient_by_states, analytic_gradient.gradient_by_motion)
@@ -145,7 +150,7 @@ def _gradient_in_stages(learner: Embodiment, factors: np.ndarray) -> Callable[..
         (gradient,) = by_motion(by_states(rows, *motion)[0], *motion)
         return (jnp.stack([jnp.asarray(x, vectors[0].dtype) for x in gradient]),)
 
-    return fused_kernel.batched_by(lambda rows, *motion: second(*first(rows, *motion), *motion), of_sample)
+    return jax.jit(fused_kernel.batched_by(lambda rows, *motion: second(*first(rows, *motion), *motion), of_sample))
 
 
 def _rows(states: LinkStates, count: int) -> Float[Array, " components"]:
