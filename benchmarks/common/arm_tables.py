@@ -9,7 +9,7 @@ from benchmarks.common.cells import MEASURES, Cells, Results, device, one, perce
 # Any arm
 
 
-def any_arm_controller(cpu: Results, random: Results) -> list[Cells]:
+def any_arm_controller(named: Results, random: Results) -> list[Cells]:
     rows: list[Cells] = [
         (
             "arms",
@@ -21,9 +21,9 @@ def any_arm_controller(cpu: Results, random: Results) -> list[Cells]:
         )
     ]
     arms = {
-        "Pandas with one or two joints locked": cpu["locks"],
-        "real arms": cpu["real"],
-        "random arms": [*random["random"], *random["report"]],
+        "Pandas with one or two joints locked": named["locks"],
+        "real arms": named["real"],
+        "random arms": random["random"],
     }
     for name, group in arms.items():
         kept = [arm for arm in group if arm["span"] >= 0.25]
@@ -80,13 +80,14 @@ def hardware_policies(results: Results) -> list[Cells]:
         "training's physics",
         "MJX",
         "virtual robot",
+        "with Ruckig's loop",
         "worst range at its end",
         "all ranges at their ends",
     )
     rows: list[Cells] = [header]
     for env, joints in JOINTS.items():
         runs = where(results["runs"], run=env)
-        gaps = [span([run[key] for run in runs]) for key in ("fused", "mjx", "virtual")]
+        gaps = [span([run[key] for run in runs]) for key in ("fused", "mjx", "virtual", "ruckig")]
         edges = [span([run[key] for run in runs if key in run]) for key in ("edges_worst", "edges_together")]
         rows.append((joints, *gaps, *edges))
     return rows
@@ -124,15 +125,6 @@ def unknown(results: Results) -> list[Cells]:
     for name in dict.fromkeys(row["set"] for row in results["rows"]):
         of_set = [one(results["rows"], set=name, controller=controller) for controller in columns]
         rows.append((UNKNOWN_SETS.get(str(name), str(name)), *(f"{100 * row['gap']:.2f}" for row in of_set)))
-    return rows
-
-
-def robot_loops(results: Results) -> list[Cells]:
-    loops = ("mimic", "ruckig")
-    rows: list[Cells] = [("held-out gap", *(f"`robot_loop={loop}`" for loop in loops))]
-    for env, joints in JOINTS.items():
-        runs = [one(results["runs"], env=env, robot_loop=loop) for loop in loops]
-        rows.append((joints, *(percent(run["optimality_gap"]) for run in runs)))
     return rows
 
 

@@ -106,7 +106,7 @@ def overview(motions: Results, pose: Results) -> list[Cells]:
     return [*rows, ("poses at their optimum per second", "", rate, "")]
 
 
-def main_results(training: Results, pose: Results, mapper: Results, any_arm: Results, loops: Results) -> list[Cells]:
+def main_results(training: Results, pose: Results, mapper: Results, any_arm: Results, hardware: Results) -> list[Cells]:
     def measure(name: str, measure: str) -> float:
         runs = where(training["rows"], env="panda4dof")
         return statistics.fmean(run["similarity"][name][measure]["held_out"] for run in runs)
@@ -121,8 +121,8 @@ def main_results(training: Results, pose: Results, mapper: Results, any_arm: Res
     gaps = [
         statistics.fmean(arm["gap"] for arm in any_arm[group] if arm["span"] >= 0.25) for group in ("locks", "real")
     ]
-    robots = [run["optimality_gap"] for run in loops["runs"]]
-    aborts = sum(run["episodes"] - run["completed"] for run in loops["runs"])
+    robots = [run[loop] for run in hardware["runs"] for loop in ("virtual", "ruckig")]
+    episodes, aborts = (sum(run[key] for run in hardware["runs"]) for key in ("episodes", "aborts"))
     return [
         ("result", "page"),
         (
@@ -147,9 +147,9 @@ def main_results(training: Results, pose: Results, mapper: Results, any_arm: Res
             "[any arm](any_arm.md#a-controller-without-training)",
         ),
         (
-            f"On virtual robots policies have gaps of {span(robots)} %, and {aborts} of "
-            f"{sum(run['episodes'] for run in loops['runs']):,} episodes were aborted. None was on hardware.",
-            "[a real arm](real_arm.md#what-was-measured)",
+            f"On virtual robots policies have gaps of {span(robots)} %, and {aborts} of {episodes:,} episodes were "
+            "aborted. None was on hardware.",
+            "[the hardware world](hardware_world.md#results)",
         ),
     ]
 

@@ -120,7 +120,7 @@ def physics(rollout: Results) -> list[Cells]:
     return rows
 
 
-def integrators(seven: Results, others: Results) -> list[Cells]:
+def integrators(accuracy: Results) -> list[Cells]:
     candidates = (
         (50, "euler", "mujoco"),
         (2, "rk4", "mujoco"),
@@ -130,7 +130,7 @@ def integrators(seven: Results, others: Results) -> list[Cells]:
         (10, "rk4", "mjx"),
         (10, "rk4", "fused"),
     )
-    results = {row["env"]: row["candidates"] for row in (*seven["results"], *others["results"])}
+    results = {row["env"]: row["candidates"] for row in accuracy["results"]}
 
     def error(env: str, substeps: int, integrator: str, engine: str) -> str:
         end = one(results[env], substeps=substeps, integrator=integrator, engine=engine)["error_mm"]["end"]

@@ -22,11 +22,11 @@ def draw_controller(results: dict[str, Any], out: Path) -> None:
     """Draws the arms with names as bars, and the random arms as points.
 
     Args:
-      results: rows by kind of arm, as `benchmarks.any_arm` writes them; `report`: more random arms, those of reports.
+      results: rows by kind of arm, as `benchmarks.any_arm` writes them.
       out: image file.
     """
-    named = [row for kind in ("presets", "locks", "real") for row in results.get(kind, []) if row["span"] >= MIN_SPAN]
-    random = [row for kind in ("random", "report") for row in results.get(kind, []) if row["span"] >= MIN_SPAN]
+    named = [row for kind in ("locks", "real") for row in results.get(kind, []) if row["span"] >= MIN_SPAN]
+    random = [row for row in results.get("random", []) if row["span"] >= MIN_SPAN]
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4), width_ratios=[2.2, 1], layout="constrained")
     places = np.arange(len(named))
     left.bar(places, [100 * row["gap"] for row in named], color=LIGHT, label="whole episode")
