@@ -48,40 +48,45 @@ def start_poses(
     if value_key(expert) == value_key(learner):
         poses[elsewhere] = np.clip(qpos[elsewhere], *pose_limits(learner, np.float32))  # measured angles may be outside
     elif elsewhere.any():
-        poses[elsewhere] = _nearest_poses(expert, learner, qpos[elsewhere], metric)
-    if capsules is not None:  # again where links come near each other: a pose then takes 100 times as long
+        poses[elsewhere] = _nearest_poses(expert, learner, metric, qpos[elsewhere])
+    if capsules is not None:
         constants = clearance_constants(learner, capsules, pairs=colliding_pairs(learner, capsules))
-        distances = clearance.pair_distances(*clearance.capsule_axes(poses, constants), constants)
-        near = elsewhere & (distances < 0.8 * CLEARANCE).any(axis=1)
-        if near.any():
-            poses[near] = _nearest_poses(expert, learner, qpos[near], metric, capsules)
+        for from_there in (True, False):  # where that fails with random guesses, which take six times as long
+            distances = clearance.pair_distances(*clearance.capsule_axes(poses, constants), constants)
+            near = elsewhere & (distances < 0.8 * CLEARANCE).any(axis=1)
+            if near.any():
+                warm_start = poses[near] if from_there else None
+                poses[near] = _nearest_poses(expert, learner, metric, qpos[near], capsules, warm_start)
     return poses
 
 
 def _nearest_poses(
     expert: Embodiment,
     learner: Embodiment,
-    qpos: Float[np.ndarray, "poses expert_joints"],
     metric: dict[str, Any],
+    qpos: Float[np.ndarray, "poses expert_joints"],
     capsules: Capsules | None = None,
+    warm_start: Float[np.ndarray, "poses joints"] | None = None,
 ) -> Float[np.ndarray, "poses joints"]:
     """The poses nearest to the expert's, see `imitate_pose`."""
     size, _ = _WITH_CAPSULES if capsules else _WITHOUT
+    rows = [np.asarray(x, np.float32) for x in (qpos, warm_start) if x is not None]
     with on_host():  # compiles several times faster, and runs once
         solve = _pose_solver(expert, learner, metric, capsules)
-        (nearest,) = by_chunks(lambda poses: (solve(poses),), np.asarray(qpos, np.float32), size=size)
+        (nearest,) = by_chunks(lambda *rows: (solve(*rows),), *rows, size=size)
     return nearest
 
 
 @functools.partial(compiled_once, options=UNOPTIMIZED)
 def _pose_solver(
     expert: Embodiment, learner: Embodiment, metric: dict[str, Any], capsules: Capsules | None
-) -> Callable[[Array], Array]:
-    """The function of the expert's poses that `_nearest_poses` compiles."""
+) -> Callable[..., Array]:
+    """The function of the expert's poses, and of initial guesses if any, that `_nearest_poses` compiles."""
     _, starts = _WITH_CAPSULES if capsules else _WITHOUT
     costs = Costs(home=_HOME, self_collision=_SELF_COLLISION if capsules else 0.0, clearance=CLEARANCE)
+    settings: dict[str, Any] = {"starts": starts, "costs": costs, "capsules": capsules, **metric}
 
-    def solve(poses: Array) -> Array:
-        return imitate_pose(expert, learner, poses, starts=starts, costs=costs, capsules=capsules, **metric).qpos
+    def solve(poses: Array, warm_start: Array | None = None) -> Array:
+        return imitate_pose(expert, learner, poses, warm_start=warm_start, **settings).qpos
 
     return solve
