@@ -33,6 +33,7 @@ from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.model_tree import quaternion
 from mimic.arms.pose_limits import pose_limits
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.hand_target import placement
@@ -190,9 +191,7 @@ def mink_model(arm: Embodiment) -> mujoco.MjModel:
         body = body.add_body(pos=anchor - origin, mass=1.0, inertia=np.ones(3), explicitinertial=True)
         limited, origin = bool(np.isfinite(low)), anchor
         body.add_joint(name=name, axis=axis, range=[low, high] if limited else [0.0, 0.0], limited=limited)
-    quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, np.asarray(arm.hand_rotation[0]).ravel())
-    body.add_site(name="hand", pos=arm.hand_position[0] - origin, quat=quaternion)
+    body.add_site(name="hand", pos=arm.hand_position[0] - origin, quat=quaternion(arm.hand_rotation[0]))
     return spec.compile()
 
 

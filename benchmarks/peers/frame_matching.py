@@ -12,8 +12,9 @@ import mink
 import numpy as np
 
 from benchmarks.peers.landmarks import Landmarks, landmarks, part_directions
+from mimic.arms.chain import smallest_rotation
 from mimic.arms.embodiment import Embodiment
-from mimic.retargeting.pose_baselines import Poses, kinematic_model, smallest_rotation
+from mimic.retargeting.pose_baselines import Poses, kinematic_model
 
 _FRAMES = ("elbow", "wrist", "hand")
 # Costs (position, orientation) of each frame in each stage, per chain length and rad: of orientations of 0.03, 0.1, 0.3

@@ -228,14 +228,16 @@ def _moved_hand(hand: Hand, rotation: np.ndarray, offset: np.ndarray, joint: int
     return Hand(rotation @ hand.position + offset, rotation @ hand.rotation, joint)
 
 
-def rotation_to(direction: np.ndarray) -> np.ndarray:
-    """The smallest rotation that maps the x-axis onto a unit direction."""
-    cosine, square_sine = direction[0], direction[1] ** 2 + direction[2] ** 2
-    if cosine < 0 and square_sine < 1e-24:  # opposite: rotation by pi about z
-        return np.diag([-1.0, -1.0, 1.0])
+def smallest_rotation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The smallest rotation that maps a unit vector onto another, [3, 3]; about any axis where they are opposite."""
+    axis, cosine = np.cross(a, b), a @ b
+    square_sine = axis @ axis
+    if cosine < 0 and square_sine < 1e-24:
+        across = np.cross(a, np.eye(3)[np.abs(a).argmin()])
+        return 2 * np.outer(across, across) / (across @ across) - np.eye(3)
     # Both are 1 / (1 + cosine), each where it does not suffer from cancellation.
     factor = 1 / (1 + cosine) if cosine > 0 else (1 - cosine) / square_sine
-    skew = np.cross(np.eye(3), np.cross([1.0, 0.0, 0.0], direction))
+    skew = np.cross(np.eye(3), axis)
     return np.eye(3) + skew + factor * skew @ skew
 
 

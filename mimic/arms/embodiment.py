@@ -22,7 +22,7 @@ from mimic.arms.chain import (
     Locked,
     lock,
     resolve_locked,
-    rotation_to,
+    smallest_rotation,
 )
 from mimic.arms.compile_check import check_magnitudes
 from mimic.arms.hand import HandChoice
@@ -250,7 +250,7 @@ def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
         joint_axis=snap_to_units(np.stack([joint.axis for joint in joints])),
         joint_anchor=snap_to_units(np.stack([joint.anchor for joint in joints])),
         link_position=snap_to_units(np.stack([link.start + frame_at * (link.end - link.start) for link in links])),
-        link_rotation=snap_to_units(np.stack([rotation_to(direction) for direction in directions])),
+        link_rotation=snap_to_units(np.stack([smallest_rotation(np.eye(3)[0], direction) for direction in directions])),
         link_lengths=np.array([link.length for link in links]),
         joint_range=np.array([joint.range for joint in joints]),
         torque_limit=np.array([joint.torque_limit for joint in joints]),
@@ -283,7 +283,7 @@ def segment_arm(arm: Embodiment) -> Embodiment:
     return dataclasses.replace(
         arm,
         link_position=snap_to_units(start),
-        link_rotation=snap_to_units(np.stack([rotation_to(direction) for direction in directions])),
+        link_rotation=snap_to_units(np.stack([smallest_rotation(np.eye(3)[0], direction) for direction in directions])),
         link_lengths=lengths,
         link_names=tuple(f"segment{i + 1}" for i in range(len(lengths))),
         link_joint=tuple(arm.link_joint[link] for link in arm.segment_link),

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 import mujoco
+import numpy as np
+from jaxtyping import Float
 
 from mimic.base.config import suggestion
 
@@ -70,3 +72,10 @@ def _names(named: Callable[[int], Any], ids: range) -> list[str]:
 def _unknown(expected: str, name: str, valid: list[str]) -> ValueError:
     choices = ", ".join(dict.fromkeys(valid)) or "none, as it names none"
     return ValueError(f"{expected}, {choices}, got {name!r:.80}{suggestion(name, valid)}")
+
+
+def quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
+    """Quaternion (w, x, y, z) of a rotation."""
+    wxyz = np.zeros(4)
+    mujoco.mju_mat2Quat(wxyz, np.ascontiguousarray(rotation, float).ravel())
+    return wxyz

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from mimic.arms.arm import Arm
 from mimic.arms.capsules import Capsules
+from mimic.arms.model_tree import quaternion
 from mimic.arms.pose_limits import pose_limits
 from mimic.arms.simulation_model import simulation_spec
 from mimic.control.joint_control import PERIOD
@@ -167,11 +168,10 @@ def _add_contacts(
         ends = [_in_body(arm, places[joint + 1], np.asarray(end[index])) for end in (capsules.start, capsules.end)]
         shape = _shape(ends, float(capsules.radius[index]))
         _body(spec, arm, joint).add_geom(**shape, name=f"capsule{index}", **_NO_CONTACT)
-    quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, arm.T_world_base[:3, :3].ravel())
+    R_world_base = arm.T_world_base[:3, :3]
     spec.worldbody.add_geom(
         name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[_FLOOR_SIZE, _FLOOR_SIZE, 0.1],
-        pos=arm.T_world_base[:3, :3] @ [0, 0, floor_height] + arm.T_world_base[:3, 3], quat=quaternion, **_NO_CONTACT,
+        pos=R_world_base @ [0, 0, floor_height] + arm.T_world_base[:3, 3], quat=quaternion(R_world_base), **_NO_CONTACT,
     )  # fmt: skip
     for i, j in pairs:
         spec.add_pair(geomname1=f"capsule{i}", geomname2=f"capsule{j}")

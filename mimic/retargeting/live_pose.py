@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.model_tree import quaternion
 from mimic.metric.distance import PARTS, Metric
 
 _ROTATION, _POSTURE, _DAMPING = 3e-4, 3e-7, 1e-7  # weights of a step; the hand's position in chain lengths has 1
@@ -119,9 +120,8 @@ def _model(
     """Joints of an arm and sites that move with them, named by their numbers, in units of a length."""
     spec, bodies = joint_spec(arm, unit)
     for site, (joint, position, rotation) in enumerate(zip(site_joint, positions, rotations, strict=True)):
-        quaternion, (body, origin) = np.zeros(4), bodies[joint + 1]
-        mujoco.mju_mat2Quat(quaternion, np.asarray(rotation, float).ravel())
-        body.add_site(name=str(site), pos=position / unit - origin, quat=quaternion)
+        body, origin = bodies[joint + 1]
+        body.add_site(name=str(site), pos=position / unit - origin, quat=quaternion(rotation))
     return spec.compile()
 
 

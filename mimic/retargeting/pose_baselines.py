@@ -10,7 +10,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from mimic.arms.chain import smallest_rotation
 from mimic.arms.embodiment import Embodiment, segment_arm
+from mimic.arms.model_tree import quaternion
 from mimic.arms.pose_limits import pose_limits
 from mimic.metric.similarity import centre_line_table
 from mimic.retargeting.live_pose import joint_spec
@@ -178,20 +180,7 @@ def kinematic_model(arm: Embodiment, sites: dict[str, int]) -> mujoco.MjModel:
             joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, limit
     for name, segment in sites.items():
         start, end = (np.asarray(points[segment]) / unit for points in (arm.segment_start, arm.segment_end))
-        rotation = smallest_rotation(np.array([1.0, 0.0, 0.0]), (end - start) / np.linalg.norm(end - start))
-        quaternion = np.zeros(4)
-        mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+        rotation = smallest_rotation(np.eye(3)[0], (end - start) / np.linalg.norm(end - start))
         body, origin = bodies[arm.link_joint[arm.segment_link[segment]] + 1]
-        body.add_site(name=name, pos=end - origin, quat=quaternion)
+        body.add_site(name=name, pos=end - origin, quat=quaternion(rotation))
     return spec.compile()
-
-
-def smallest_rotation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest rotation that maps a unit vector onto another, [3, 3]; about any axis where they are opposite."""
-    middle = a + b
-    square = middle @ middle
-    if square < 1e-12:
-        across = np.cross(a, np.eye(3)[np.abs(a).argmin()])
-        across /= np.linalg.norm(across)
-        return 2 * np.outer(across, across) - np.eye(3)
-    return np.eye(3) - 2 * np.outer(middle, middle) / square + 2 * np.outer(b, a)

@@ -8,11 +8,12 @@ import viser
 
 from mimic.arms.arm import build_arm
 from mimic.arms.link_match import hand_poses
+from mimic.arms.model_tree import quaternion
 from mimic.envs.config import EnvConfig
 from mimic.motions.demonstrations import Demonstrations
 from mimic.motions.recording import record_demonstrations
 from mimic.viewer.live_session import LiveSession
-from mimic.viewer.meshes import pose_matrix, quaternion
+from mimic.viewer.meshes import pose_matrix
 from mimic.viewer.page import EXPERT_BASE
 
 _DEMONSTRATIONS = 8  # number to choose from; recorded when the first one is played

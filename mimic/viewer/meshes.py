@@ -114,13 +114,6 @@ def capsule_mesh(capsule: Capsule) -> tuple[Float[np.ndarray, "vertices 3"], Int
     return vertices - [0, 0, vertices[:, 2].min() + capsule.radius], np.asarray(mesh.faces, np.int32)
 
 
-def quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
-    """Quaternion (w, x, y, z) of a rotation."""
-    wxyz = np.zeros(4)
-    mujoco.mju_mat2Quat(wxyz, np.ascontiguousarray(rotation, float).ravel())
-    return wxyz
-
-
 def pose_matrix(position: Any, wxyz: Any) -> Float[np.ndarray, "4 4"]:
     """The homogeneous matrix of a position and a quaternion (w, x, y, z)."""
     rotation, transform = np.zeros(9), np.eye(4)

@@ -8,10 +8,11 @@ import viser
 from jaxtyping import Float
 
 from mimic.arms.link_match import LinkMatch
+from mimic.arms.model_tree import quaternion
 from mimic.viewer import html
 from mimic.viewer.hand_following import HandFrame
 from mimic.viewer.live_session import Frame
-from mimic.viewer.meshes import ArmShape, Part, along_z, capsule_mesh, places, quaternion
+from mimic.viewer.meshes import ArmShape, Part, along_z, capsule_mesh, places
 
 _GRID = 0.1, 0.5  # m, sizes of a cell and of a section
 _STANCE = np.array([2.5, -0.1, 0.75])  # camera position relative to its target, in arm lengths

@@ -9,6 +9,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from mimic.arms.model_tree import quaternion
 from mimic.arms.mujoco_chain import UNKNOWN_HAND
 from mimic.motions.mocap.link_motion import CUTOFF, LinkMotion, motion_states
 
@@ -29,13 +30,13 @@ def ball_chain_xml(motion: LinkMotion, zero: Float[np.ndarray, "links 3 3"]) -> 
     def body(link: int) -> str:
         name, length, parent = motion.names[link], lengths[link], motion.parents[link]
         place = f"{lengths[parent]:.9g} 0 0" if parent >= 0 else _text(base_points[link])
-        quaternion = _text(_quaternion((zero[parent] if parent >= 0 else np.eye(3)).T @ zero[link]))
+        turn = _text(quaternion((zero[parent] if parent >= 0 else np.eye(3)).T @ zero[link]))
         tip = f"0 0 0 {length:.9g} 0 0"
         joints = "".join(f'<joint name="{name}_{axis}" axis="{_text(np.eye(3)["xyz".index(axis)])}"/>' for axis in AXES)
         mass = 1000 * np.pi * radius**2 * length  # of water
         inertia = mass * np.array([radius**2 / 2, length**2 / 12, length**2 / 12])
         shapes = (
-            f'<body name="{name}" pos="{place}" quat="{quaternion}">{joints}'
+            f'<body name="{name}" pos="{place}" quat="{turn}">{joints}'
             f'<inertial pos="{length / 2:.9g} 0 0" mass="{mass:.6g}" diaginertia="{_text(inertia)}"/>'
             f'<site name="link_{name}" type="capsule" fromto="{tip}" size="0.01"/>'
             f'<geom type="capsule" fromto="{tip}" size="{radius:.4g}" rgba="{_COLOUR}" contype="0" conaffinity="0"/>\n'
@@ -173,13 +174,6 @@ def _joint_axes(angles: np.ndarray) -> np.ndarray:
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Wxyz."""
-    from scipy.spatial.transform import Rotation
-
-    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
 
 
 def _text(values: np.ndarray) -> str:
