@@ -5,6 +5,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from mimic.base.compilation import has_tracer
 
 
 def over_batch(function: Callable[..., Any], *arguments: Any, axes: int) -> Any:
@@ -28,3 +32,21 @@ def over_batch(function: Callable[..., Any], *arguments: Any, axes: int) -> Any:
 
     results = jax.vmap(function)(*jax.tree.map(rows, arguments))
     return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), results)
+
+
+def floats(values: ArrayLike, name: str) -> Any:
+    """The values as floating-point numbers of 32 bits or more: a NumPy array, which no device gets, or a JAX array.
+
+    Raises:
+      ValueError: rows of different lengths, or entries that are no real numbers.
+    """
+    try:
+        array: Any = jnp.asarray(values) if has_tracer(values) else values
+        array = array if isinstance(array, jax.Array) else np.asarray(array)
+    except ValueError:
+        raise ValueError(f"{name}: expected rows of one length, got {values!r:.80}") from None
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array if array.dtype.itemsize >= 4 else array.astype(np.float32)
+    if not jnp.issubdtype(array.dtype, jnp.integer) and array.dtype != bool:
+        raise ValueError(f"{name}: expected real numbers, got {array.dtype} in {values!r:.80}")
+    return array.astype(jnp.result_type(float))

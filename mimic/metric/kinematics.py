@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from mimic.arms.arrays import ArmArrays
 from mimic.arms.embodiment import LONG, Embodiment
 from mimic.base import spatial
-from mimic.base.batches import over_batch
+from mimic.base.batches import floats, over_batch
 from mimic.base.spatial import Rotation, Vector
 from mimic.metric.hand import HandStates
 
@@ -514,10 +514,9 @@ def joint_values(arm: Embodiment | ArmArrays, values: ArrayLike, name: str) -> A
       name: of the argument, for the error.
 
     Raises:
-      ValueError: another shape.
+      ValueError: another shape, or no real numbers.
     """
-    values = jnp.asarray(values)
+    values = jnp.asarray(floats(values, name))
     if values.ndim == 0 or values.shape[-1] != arm.num_joints:
         raise ValueError(f"{name}: expected shape [..., {arm.num_joints}] for {arm.name}, got {values.shape}")
-    is_floating = jnp.issubdtype(values.dtype, jnp.floating)
-    return values if is_floating else values.astype(jnp.result_type(values.dtype, jnp.float32))
+    return values

@@ -14,7 +14,7 @@ from mimic.metric.distance import NO_HAND, Correspondence, HandWeights, Metric, 
 from mimic.retargeting.hand_speeds import speeds_needed
 from mimic.retargeting.hand_target import POSITION_TOLERANCE, Placement, placement
 from mimic.retargeting.pose import checked_poses, imitate_pose
-from mimic.retargeting.trajectory import imitate_trajectory
+from mimic.retargeting.trajectory import checked_jump, imitate_trajectory
 
 _FRAMES, _BASES, _ROUNDS = 36, 64, 3  # frames that judge a base, bases in each round of the search, and rounds
 _SPREAD = np.array([0.5, 0.5, 0.2, np.pi])  # of the first round: chain lengths of the expert, and rad
@@ -67,11 +67,11 @@ def find_base(
     """
     if not len(motions):
         raise ValueError("motions: expected at least one, got none")
-    paths = [checked_poses(expert, np.asarray(motion, np.float32), "motions", axes=("time",)) for motion in motions]
+    paths = [np.asarray(checked_poses(expert, motion, "motions", axes=("time",)), np.float32) for motion in motions]
     paths = sorted(paths, key=len, reverse=True)
     poses, longest = np.concatenate(paths), paths[0]
     steps = np.concatenate([np.diff(path, axis=0, append=path[-1:]) for path in paths])
-    jump = np.broadcast_to(np.asarray(largest_jump, float), (learner.num_joints,))
+    jump = checked_jump(learner, largest_jump)
     metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
     places, part = _places(expert, poses), _FRAMES // 3
     speed = np.linalg.norm(_places(expert, poses + steps) - places, axis=1)

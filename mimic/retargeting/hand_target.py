@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment, in_chain_lengths
 from mimic.base import spatial
+from mimic.base.batches import floats
 from mimic.base.spatial import Rotation, Scalar, Vector
 from mimic.metric.kinematics import JointFrame, LinkStates, hand_vectors, joint_axes, joint_frames
 from mimic.retargeting.optimizers import Derivatives, Scalars
@@ -73,9 +74,9 @@ def placement(base: Any) -> Placement:
     """
     if isinstance(base, Placement):
         return base
-    values = np.zeros(4) if base is None else np.asarray(base, float)
+    values = np.zeros(4) if base is None else np.asarray(floats(base, "base"), float)
     if values.shape not in ((4,), (4, 4)) or not np.all(np.isfinite(values)):
-        raise ValueError(f"base: expected [x, y, z, yaw] or a pose [4, 4], all finite, got {np.asarray(base).tolist()}")
+        raise ValueError(f"base: expected [x, y, z, yaw] or a pose [4, 4], all finite, got {values.tolist()}")
     if values.shape == (4,):
         if abs(values[3]) > 2 * np.pi:
             raise ValueError(f"base: expected a yaw of at most 2 pi rad, got {values[3]:g}")

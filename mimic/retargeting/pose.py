@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from mimic.arms.arrays import ArmArrays
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints, pose_limits
+from mimic.base.batches import floats
 from mimic.base.compilation import compiled_once
 from mimic.base.config import check_choice
 from mimic.base.spatial import array_library
@@ -30,7 +31,6 @@ from mimic.retargeting.pose_objective import PoseObjective, pose_objective
 
 Hand = Literal["free", "exact"]
 HANDS = ("free", "exact")
-AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
 ITERATIONS = 16
 STARTS = {"free": 12, "exact": 35}
@@ -119,21 +119,21 @@ def imitate_pose(
     Raises:
       ValueError: poses of the wrong shape, not finite or above 10,000 rad, or a count below its minimum.
     """
-    poses = checked_poses(expert, _concrete(qpos))
+    poses = checked_poses(expert, qpos)
     # Longer than 40 lines: argument checks, and functions that share the arguments.
     check_hand(hand, base, expert, learner)
     starts = STARTS[hand] if starts is None else starts
-    if starts < 0 or iterations < 2:
-        raise ValueError(f"starts, iterations: expected at least 0 and 2, got {starts} and {iterations}")
-    if kept is not None and kept < 1:
-        raise ValueError(f"kept: expected at least 1, or None for all, got {kept}")
+    check_count("starts", starts, 0)
+    check_count("iterations", iterations, 2)
+    if kept is not None:
+        check_count("kept", kept, 1)
     costs = NO_COSTS if costs is None else costs
     costs.check_capsules(capsules)
     if costs.of_motion:
         raise ValueError(
             "costs: expected velocity and acceleration of 0 for single poses; imitate_trajectory takes them"
         )
-    warm = None if warm_start is None else checked_poses(learner, _concrete(warm_start), "warm_start")
+    warm = None if warm_start is None else checked_poses(learner, warm_start, "warm_start")
     metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
     descents = Descents(iterations, kept)
     dtype = jax.dtypes.canonicalize_dtype(poses.dtype)
@@ -173,6 +173,12 @@ def _pose_solver(
         return _nearest(expert, learner, objective, descents, batch, warm, candidates, random)
 
     return solve
+
+
+def check_count(name: str, value: Any, at_least: int) -> None:
+    """Raises a `ValueError` for what is no whole number of at least the minimum."""
+    if not isinstance(value, int | np.integer) or value < at_least:
+        raise ValueError(f"{name}: expected a whole number of at least {at_least}, got {value!r}")
 
 
 def check_hand(hand: Hand, base: Any, expert: Embodiment | ArmArrays, learner: Embodiment | ArmArrays) -> None:
@@ -331,25 +337,25 @@ def shared_joints(
 
 
 def checked_poses(
-    arm: Embodiment | ArmArrays, poses: AnyArray, name: str = "qpos", *, axes: Sequence[str] = ()
-) -> AnyArray:
-    """The poses as floating-point numbers.
+    arm: Embodiment | ArmArrays, poses: ArrayLike, name: str = "qpos", *, axes: Sequence[str] = ()
+) -> Any:
+    """The poses as floating-point numbers, a JAX array where they are one and else a NumPy array.
 
     Args:
       arm: the embodiment.
-      poses: joint angles [rad], NumPy or JAX array.
+      poses: joint angles [rad].
       name: of the argument, for the error.
       axes: names of the required axes before that of the joints.
 
     Raises:
       ValueError: the shape is not [..., *axes, joints], there is no pose, or an angle is no number up to 10,000 rad.
     """
+    poses = floats(poses, name)
     if poses.ndim <= len(axes) or poses.shape[-1] != arm.num_joints:
         shape = ", ".join(["...", *axes, str(arm.num_joints)])
         raise ValueError(f"{name}: expected shape [{shape}] for {arm.name}, got {poses.shape}")
     if not poses.size:
         raise ValueError(f"{name}: expected one pose or more, got shape {poses.shape}")
-    poses = poses if jnp.issubdtype(poses.dtype, jnp.floating) else poses.astype(float)
     if not isinstance(poses, Tracer) and not np.all(np.abs(values := np.asarray(poses)) <= _LARGEST_ANGLE):
         worst = values[~(np.abs(values) <= _LARGEST_ANGLE)][0]
         raise ValueError(f"{name}: expected finite angles of at most {_LARGEST_ANGLE:,g} rad, got {worst:g}")

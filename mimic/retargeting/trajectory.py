@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints, pose_limits
+from mimic.base.batches import floats
 from mimic.base.compilation import compiled_once, has_tracer
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.hand import NO_HAND, HandWeights
@@ -31,6 +32,7 @@ from mimic.retargeting.pose import (
     STARTS,
     Hand,
     PoseImitation,
+    check_count,
     check_hand,
     checked_poses,
     shared_joints,
@@ -93,18 +95,15 @@ def imitate_trajectory(
     Raises:
       ValueError: what `imitate_pose` rejects, or a jump that is not above 0.
     """
-    poses = checked_poses(expert, jnp.asarray(qpos))
+    poses = jnp.asarray(checked_poses(expert, qpos))
     if poses.ndim != 2:
         raise ValueError(f"qpos: expected shape [time, {expert.num_joints}], got {poses.shape}")
-    if not np.all(np.asarray(largest_jump) > 0):
-        raise ValueError(f"largest_jump: expected angles above 0 rad, got {largest_jump}")
+    jump = jnp.asarray(checked_jump(learner, largest_jump), poses.dtype)
     check_hand(hand, base, expert, learner)
     starts = STARTS[hand] if starts is None else starts
-    if starts < 0:
-        raise ValueError(f"starts: expected at least 0, got {starts}")
+    check_count("starts", starts, 0)
     costs = Costs() if costs is None else costs
     costs.check_capsules(capsules)
-    jump = jnp.broadcast_to(jnp.asarray(largest_jump, poses.dtype), (learner.num_joints,))
     metric = Metric(correspondence, weights, rotation, reduction, hand_weights)
     capsules = capsules if costs.of_capsules else None
     if hand == "exact":
@@ -118,6 +117,21 @@ def imitate_trajectory(
         return PoseImitation(qpos, distance, exact, HandError(position, angle, exact))
     solve = _trajectory_solver(expert, learner, metric, bool(starts), costs, capsules)
     return solve(poses, jump, random_poses(learner, key, max(starts, 1), poses.dtype))
+
+
+def checked_jump(learner: Embodiment, largest_jump: Any) -> Float[np.ndarray, " joints"]:
+    """The maximum change of each joint [rad].
+
+    Raises:
+      ValueError: neither one angle above 0 nor one for each joint.
+    """
+    jump = np.asarray(floats(largest_jump, "largest_jump"))
+    if jump.shape not in ((), (learner.num_joints,)) or not np.all(jump > 0):
+        raise ValueError(
+            f"largest_jump: expected an angle above 0 rad, or {learner.num_joints}, one for each joint of "
+            f"{learner.name}, got {jump.tolist()}"
+        )
+    return np.broadcast_to(jump, learner.num_joints)
 
 
 @compiled_once

@@ -12,7 +12,7 @@ from mimic.metric.correspondence import arc_length_correspondence, hard_correspo
 from mimic.metric.distance import DistanceWeights, adaptive_weights, embodiment_distance
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.closed_form import SMOOTHING
-from mimic.retargeting.pose import imitate_pose
+from mimic.retargeting.pose import checked_poses, imitate_pose
 from mimic.retargeting.trajectory import imitate_trajectory
 from tests.helpers.metric_cases import planar_optimum
 
@@ -174,9 +174,14 @@ def test_trajectories_do_not_jump(metric, limits):
         (np.full(7, np.nan), {}, "qpos: expected finite angles of at most 10,000 rad, got nan"),
         (np.array([0, 0, -1e30, 0, 0, 0, 0]), {}, "qpos: expected finite angles of at most 10,000 rad, got -1e\\+30"),
         (np.zeros((0, 7)), {}, "qpos: expected one pose or more"),
-        (np.zeros(7), {"starts": -1}, "starts, iterations"),
+        (np.zeros(7), {"starts": -1}, "starts: expected a whole number of at least 0, got -1"),
+        (np.zeros(7), {"starts": 2.5}, "starts: expected a whole number of at least 0, got 2.5"),
+        (["a"] * 7, {}, "qpos: expected real numbers, got <U1"),
+        (np.zeros(7, complex), {}, "qpos: expected real numbers, got complex128"),
+        ([[0] * 7, [0] * 6], {}, "qpos: expected rows of one length"),
+        (np.zeros(7), {"hand": "exact", "base": "left"}, "base: expected real numbers"),
         (np.zeros(7), {"hand": "near"}, "hand: expected one of free, exact, got 'near'"),
-        (np.zeros(7), {"kept": 0}, "kept: expected at least 1, or None for all, got 0"),
+        (np.zeros(7), {"kept": 0}, "kept: expected a whole number of at least 1, got 0"),
         (np.zeros(7), {"warm_start": np.zeros(7)}, r"warm_start: expected shape \[..., 4\]"),
     ],
 )
@@ -184,5 +189,15 @@ def test_bad_input_is_rejected(qpos, options, message):
     expert, learner = PAIRS["planar 7->4"]
     with pytest.raises(ValueError, match=message):
         imitate_pose(expert, learner, qpos, jnp.ones((7, 4)), DIRECTIONS, **options)
-    with pytest.raises(ValueError, match="largest_jump"):
-        imitate_trajectory(expert, learner, np.zeros((3, 7)), jnp.ones((7, 4)), DIRECTIONS, largest_jump=0.0)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("jump", [0.0, np.nan, "fast", [0.1] * 7])
+def test_a_jump_that_is_no_angle_is_rejected(jump):
+    expert, learner = PAIRS["planar 7->4"]
+    with pytest.raises(ValueError, match="largest_jump: expected"):
+        imitate_trajectory(expert, learner, np.zeros((3, 7)), jnp.ones((7, 4)), DIRECTIONS, largest_jump=jump)
+
+
+def test_half_precision_is_widened():
+    assert checked_poses(PAIRS["planar 7->4"][0], np.zeros(7, np.float16)).dtype == np.float32

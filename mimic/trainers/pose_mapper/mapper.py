@@ -88,7 +88,7 @@ class PoseMapper:
         Raises:
           ValueError: poses of the wrong shape, not finite, or outside of the expert's joint range.
         """
-        poses = checked_poses(self.expert, jnp.asarray(qpos))
+        poses = jnp.asarray(checked_poses(self.expert, qpos))
         if not isinstance(poses, Tracer):
             _check_range(self.expert, np.asarray(poses))
         learner_poses = self.model.of_poses(self.params, poses.reshape(-1, poses.shape[-1]))
