@@ -1,7 +1,6 @@
 """Controller bundles without a training, for Pandas with policies of a line."""
 
 import functools
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +37,12 @@ def panda_clearance(locked: tuple[int, ...] = ()) -> ClearanceConstants:
 
 
 @functools.cache
-def parameters(locked: tuple[int, ...] = ()) -> JointParameters:
+def parameters() -> JointParameters:
     """The parameters of the inner loop of a Panda in the hardware world."""
-    config = env_config("panda7dof", world="hardware", learner={"locked": list(locked)})
+    config = env_config("panda7dof", world="hardware")
     scales = {"action_scale": config.action_scale, "control_dt": config.control_dt}
     assert config.world is not None
-    plant = make_plant(config.learner, panda(locked), config.world, **scales)
+    plant = make_plant(config.learner, panda(), config.world, **scales)
     return JointParameters(*(np.asarray(x, float) for x in plant.constants.parameters))
 
 
@@ -79,23 +78,21 @@ def make_bundle(
     action: Any = sine,
     *,
     mode: str = "joint_velocity",
-    locked: Sequence[int] = (),
-    start_poses: np.ndarray | None = None,
     ticks: int = TICKS,
     clearance: ClearanceConstants | None = None,
     network: bytes | None = None,
 ) -> Any:
     """Writes a bundle for a Panda and loads it."""
-    arm, locked = panda(tuple(locked)), tuple(locked)
-    limits = drives_of(ArmConfig(locked=list(locked)), arm).limits
+    arm = panda()
+    limits = drives_of(ArmConfig(), arm).limits
     home, joints = np.asarray(arm.embodiment.home), arm.embodiment.num_joints
-    start_poses = np.stack([home, home]) if start_poses is None else start_poses
+    start_poses = np.stack([home, home])
     expert = np.zeros((len(start_poses), ticks + 1, LINKS * 12))
     expert[:, :, 0] = 2 * np.pi * CONTROL_DT * np.arange(ticks + 1)  # one cycle a second
     write_bundle(
         folder,
         policy=network or policy(joints, joints, action),
-        clearance=clearance or panda_clearance(locked),
+        clearance=clearance or panda_clearance(),
         controller={
             "mimic_version": "test",
             "robot": "panda",
@@ -103,7 +100,7 @@ def make_bundle(
             "control_dt": CONTROL_DT,
             "joint_names": list(arm.embodiment.joint_names),
             "limits": limits.as_lists(),
-            "parameters": {name: x.tolist() for name, x in parameters(locked)._asdict().items()},
+            "parameters": {name: x.tolist() for name, x in parameters()._asdict().items()},
             "preview": PREVIEW,
             "past_actions": PAST,
             "expert_numbers": 12 * LINKS,

@@ -271,31 +271,26 @@ def test_commanded_steps_of_the_hand_are_in_the_axes_of_the_learners_base(tmp_pa
     np.testing.assert_array_equal(written[:, 6], steps[:, 6])
 
 
-def test_a_hand_that_presses_fits_its_commanded_steps_and_another_arm_does_not():
-    """Commands along z press on a table, so that the hand of the right arm moves in the plane alone."""
+@pytest.mark.parametrize("case", ["presses", "is led along one axis"])
+def test_a_hand_fits_its_commanded_steps_and_another_arm_does_not(case):
+    """Commands along z press on a table; or the hand is led along y and trembles along the others."""
     arm, time = mimic.panda(), np.arange(200) / RATE
-    qpos = np.array(arm.home) + 0.3 * np.sin(time[:, None] * np.linspace(0.7, 1.9, 7))
-    samples = samples_of({"a": Motion(time, qpos, None)})
-    hand, _ = hand_points(arm, qpos)
-    steps = np.vstack([np.zeros((1, 3)), np.diff(hand, axis=0)[1:], np.zeros((1, 3))])  # each a sample ahead
-    steps[:, 2] = 2 * np.abs(steps).max() * np.where(np.arange(len(steps)) % 9 < 4, 1, -1)
-    evidence = _of_hand_steps(arm, samples, np.roll(steps, -1, axis=0))
-    negated = evidence.rows * [1, -1, 1, 1, 1, 1, 1]
-    right, wrong = evidence.errors(np.stack([evidence.rows, negated]))[:, 0]
-    assert right < evidence.tolerance / 2
-    assert wrong > evidence.tolerance
-
-
-def test_a_hand_that_is_led_along_one_axis_fits_its_commanded_steps():
-    """The hand also trembles along the others, which nothing commands."""
-    arm, time = mimic.panda(), np.arange(200) / RATE
-    tremor = 1e-4 * np.random.default_rng(0).normal(size=(200, 7))
-    qpos = np.array(arm.home) + tremor + 0.1 * np.sin(time[:, None]) * np.eye(7)[0]  # along y
+    if case == "presses":
+        motion, negated = 0.3 * np.sin(time[:, None] * np.linspace(0.7, 1.9, 7)), 1
+    else:
+        tremor = 1e-4 * np.random.default_rng(0).normal(size=(200, 7))
+        motion, negated = tremor + 0.1 * np.sin(time[:, None]) * np.eye(7)[0], 0
+    qpos = np.array(arm.home) + motion
     samples, (hand, _) = samples_of({"a": Motion(time, qpos, None)}), hand_points(arm, qpos)
-    steps = np.vstack([np.diff(hand, axis=0), np.zeros((1, 3))]) * [0, 1, 0]
+    steps = np.vstack([np.diff(hand, axis=0), np.zeros((1, 3))])
+    if case == "presses":
+        steps[0] = 0
+        steps[:, 2] = 2 * np.abs(steps).max() * np.where(np.arange(len(steps)) % 9 < 4, 1, -1)
+    else:
+        steps[:, [0, 2]] = 0
     evidence = _of_hand_steps(arm, samples, np.roll(steps, -1, axis=0))
-    negated = evidence.rows * [-1, 1, 1, 1, 1, 1, 1]
-    right, wrong = evidence.errors(np.stack([evidence.rows, negated]))[:, 0]
+    other = evidence.rows * (1 - 2 * np.eye(7)[negated])
+    right, wrong = evidence.errors(np.stack([evidence.rows, other]))[:, 0]
     assert right < evidence.tolerance / 2
     assert wrong > evidence.tolerance
 
