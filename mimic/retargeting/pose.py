@@ -350,13 +350,13 @@ def checked_poses(
     Raises:
       ValueError: the shape is not [..., *axes, joints], there is no pose, or an angle is no number up to 10,000 rad.
     """
-    poses = floats(poses, name)
-    if poses.ndim <= len(axes) or poses.shape[-1] != arm.num_joints:
+    array: Any = floats(poses, name)
+    if array.ndim <= len(axes) or array.shape[-1] != arm.num_joints:
         shape = ", ".join(["...", *axes, str(arm.num_joints)])
-        raise ValueError(f"{name}: expected shape [{shape}] for {arm.name}, got {poses.shape}")
-    if not poses.size:
-        raise ValueError(f"{name}: expected one pose or more, got shape {poses.shape}")
-    if not isinstance(poses, Tracer) and not np.all(np.abs(values := np.asarray(poses)) <= _LARGEST_ANGLE):
+        raise ValueError(f"{name}: expected shape [{shape}] for {arm.name}, got {array.shape}")
+    if not array.size:
+        raise ValueError(f"{name}: expected one pose or more, got shape {array.shape}")
+    if not isinstance(array, Tracer) and not np.all(np.abs(values := np.asarray(array)) <= _LARGEST_ANGLE):
         worst = values[~(np.abs(values) <= _LARGEST_ANGLE)][0]
         raise ValueError(f"{name}: expected finite angles of at most {_LARGEST_ANGLE:,g} rad, got {worst:g}")
-    return poses
+    return array
