@@ -85,13 +85,14 @@ def unseen_motions(motions: Results) -> list[Cells]:
 
 def motions_from_anywhere(motions: Results) -> list[Cells]:
     """Mean distance above the bound, in thousandths, on kinds of motions that no training has, by environment."""
-    names = "policy", "nearest_pose", "computed_torque"
+    names = "policy", "nearest_pose", "computed_torque", "whole_motion"
     rows: list[Cells] = [("joints", "motions", "holding still", "policy", *(f"`{name}`" for name in names[1:]))]
     new = where(motions["rows"], set="new")
     for env, kind in dict.fromkeys((row["env"], row["kind"]) for row in new):
         of_kind = {row["controller"]: row for row in where(new, env=env, kind=kind)}
-        excess = of_kind["policy"]["excess_of_holding"], *(of_kind[name]["excess"] for name in names)
-        rows.append((ENVIRONMENTS[env].split()[-1], kind.replace("_", " "), *(f"{1000 * x:.1f}" for x in excess)))
+        excess = [of_kind[name]["excess"] if name in of_kind else None for name in names]
+        cells = ("" if x is None else f"{1000 * x:.1f}" for x in (of_kind["policy"]["excess_of_holding"], *excess))
+        rows.append((ENVIRONMENTS[env].split()[-1], kind.replace("_", " "), *cells))
     return rows
 
 
