@@ -1,8 +1,7 @@
 """`python -m mimic.inspect`: shows the joints, links and limits of an arm, and how closely it can imitate."""
 
 import dataclasses
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,39 +29,11 @@ from mimic.commands.printed import say, train_command
 from mimic.envs.config import EnvConfig
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.motions.demonstrations import Demonstrations
-from mimic.runs.files import finite
+from mimic.runs.files import write_report
 from mimic.trainers.progress import similarity_table
 
 _PICTURE, _RESULTS = "arms.png", "inspection.json"
 _SCENE = 800, 640  # pixels
-
-
-@dataclasses.dataclass(frozen=True)
-class Inspection:
-    """Results of an inspection.
-
-    Attributes:
-      joints, links: tables of the learner's joints and links, one entry for each row.
-      ends: where the learner's chains end, and its hand frames.
-      ignored: elements of the model that are ignored.
-      assumed: values that the model lacks.
-      warnings: reasons why the learner may imitate badly.
-      reachable: distance that the learner can reach; None without `bound`.
-      similarity: similarity of the nearest poses; None without `bound`.
-      reach: what the hand keeps; None without `bound`, or for an arm without a hand.
-      command: command that trains the learner.
-    """
-
-    joints: list[dict[str, Any]]
-    links: list[dict[str, Any]]
-    ends: list[str]
-    ignored: list[str]
-    assumed: list[str]
-    warnings: list[str]
-    reachable: arm_checks.ReachableDistance | None
-    similarity: Mapping[str, Any] | None
-    reach: HandReach | None
-    command: str
 
 
 def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
@@ -82,26 +53,26 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
 
     def run() -> None:
         console = Console()
-        inspection = _inspect(config, env, expert, learner, demonstrations)
-        _print(console, inspection, expert, learner, is_searched=config.base == "auto")
+        results, reach = _inspect(config, env, expert, learner, demonstrations)
+        _print(console, results, reach, expert, learner, is_searched=config.base == "auto")
         if out and scene:
             out.mkdir()
             home = [np.asarray(expert.embodiment.home), np.asarray(learner.embodiment.home)]
             with scene:
                 scene.fit([pose[None] for pose in home])
                 image = scene.image(home)
-            _save_picture(out / _PICTURE, image, expert, learner, env, inspection.reach)
-            _write(out / _RESULTS, inspection, expert, learner)
+            _save_picture(out / _PICTURE, image, expert, learner, env, reach)
+            write_report(out, results, _RESULTS)
             say(console, f"results: {out}")
-        say(console, f"train it: {inspection.command}")
+        say(console, f"train it: {results['train']}")
 
     return run
 
 
 def _inspect(
     config: InspectConfig, env: EnvConfig, expert: Arm, learner: Arm, demonstrations: Demonstrations | None
-) -> Inspection:
-    """Inspects the learner; computes its reachable distance on the demonstrations, if there are any."""
+) -> tuple[dict[str, Any], HandReach | None]:
+    """The content of inspection.json, and what the hand keeps; without demonstrations no distance and no hand."""
     stable_config, reason = arm_checks.stabilised(config.learner, learner, env)
     reachable = similarity = reach = None
     if demonstrations is not None:
@@ -111,64 +82,43 @@ def _inspect(
         if all(arm.embodiment.hand_joint for arm in (expert, learner)):
             base = "auto" if config.base == "auto" else base_numbers(config.base)
             reach = hand_reach(config.expert, config.learner, env.metric, base)
-    return Inspection(
-        joints=_joints(learner, config.learner, env),
-        links=_links(expert, learner, env),
-        ends=[with_full_keys(end.reason, "learner") for end in learner.ends],
-        ignored=list(learner.notes),
-        assumed=list(arm_checks.assumptions(config.learner, learner)),
-        warnings=[
+    results = {
+        "arm": learner.embodiment.name,
+        "expert": expert.embodiment.name,
+        "joints": _joints(learner, config.learner, env),
+        "links": _links(expert, learner, env),
+        "ends": [with_full_keys(end.reason, "learner") for end in learner.ends],
+        "set_aside": list(learner.notes),
+        "assumed": list(arm_checks.assumptions(config.learner, learner)),
+        "mind": [
             *arm_checks.hand_doubts("expert", expert),
             *arm_checks.warnings(config.learner, learner),
             *([reason] if reason else []),
         ],
-        reachable=reachable,
-        similarity=similarity,
-        reach=reach,
-        command=train_command(dataclasses.replace(env, learner=stable_config)),
-    )
-
-
-def _print(console: Console, inspection: Inspection, expert: Arm, learner: Arm, *, is_searched: bool) -> None:
-    say(console, _headline(expert, learner))
-    console.print(_table(f"joints of {learner.embodiment.name}", inspection.joints))
-    console.print(_table("links, and the expert links that they are compared with", inspection.links))
-    notes = {
-        "ends at": inspection.ends,
-        "ignored": inspection.ignored,
-        "assumed": inspection.assumed,
-        "warning": inspection.warnings,
-    }
-    for label, lines in notes.items():
-        say(console, *(f"{label}: {line}" for line in lines))
-    if inspection.reachable is not None and inspection.similarity is not None:
-        say(console, _distance_line(inspection.reachable, expert))
-        console.print(similarity_table(inspection.similarity))
-    if inspection.reach is not None:
-        pair = expert.embodiment, learner.embodiment
-        console.print(reach_table(inspection.reach, pair))
-        say(console, *reach_lines(inspection.reach, pair, is_searched=is_searched))
-
-
-def _write(path: Path, inspection: Inspection, expert: Arm, learner: Arm) -> None:
-    """Writes the results as JSON."""
-    reachable = inspection.reachable
-    results = {
-        "arm": learner.embodiment.name,
-        "expert": expert.embodiment.name,
-        "joints": inspection.joints,
-        "links": inspection.links,
-        "ends": inspection.ends,
-        "set_aside": inspection.ignored,
-        "assumed": inspection.assumed,
-        "mind": inspection.warnings,
         "bound": reachable and reachable.bound,
         "hold": reachable and reachable.hold,
-        "similarity": inspection.similarity,
-        "hand": inspection.reach and inspection.reach.summary(),
-        "train": inspection.command,
+        "similarity": similarity,
+        "hand": reach and reach.summary(),
+        "train": train_command(dataclasses.replace(env, learner=stable_config)),
     }
-    path.write_text(json.dumps(finite(results), indent=2, allow_nan=False) + "\n")
+    return results, reach
+
+
+def _print(
+    console: Console, results: dict[str, Any], reach: HandReach | None, expert: Arm, learner: Arm, *, is_searched: bool
+) -> None:
+    say(console, _headline(expert, learner))
+    console.print(_table(f"joints of {results['arm']}", results["joints"]))
+    console.print(_table("links, and the expert links that they are compared with", results["links"]))
+    for label, key in (("ends at", "ends"), ("ignored", "set_aside"), ("assumed", "assumed"), ("warning", "mind")):
+        say(console, *(f"{label}: {line}" for line in results[key]))
+    if results["similarity"] is not None:
+        say(console, _distance_line(results))
+        console.print(similarity_table(results["similarity"]))
+    if reach is not None:
+        pair = expert.embodiment, learner.embodiment
+        console.print(reach_table(reach, pair))
+        say(console, *reach_lines(reach, pair, is_searched=is_searched))
 
 
 def _joints(arm: Arm, config: ArmConfig, env: EnvConfig) -> list[dict[str, Any]]:
@@ -243,10 +193,10 @@ def _headline(expert: Arm, learner: Arm) -> str:
     )
 
 
-def _distance_line(reachable: arm_checks.ReachableDistance, expert: Arm) -> str:
-    bound, hold = reachable.bound, reachable.hold
+def _distance_line(results: dict[str, Any]) -> str:
+    bound, hold = results["bound"], results["hold"]
     return (
-        f"distance on random demonstrations of {expert.embodiment.name}: {bound:.3f} for the best poses, {hold:.3f} "
+        f"distance on random demonstrations of {results['expert']}: {bound:.3f} for the best poses, {hold:.3f} "
         f"for holding the start pose; imitation can reduce it by {1 - bound / hold:.0%}"
     )
 

@@ -28,9 +28,9 @@ def written_atomically(folder: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def write_report(run_dir: Path, report: Mapping[str, Any]) -> None:
-    """Writes report.json; numbers that are not finite, as after a divergence, are null."""
-    write_atomically(run_dir / REPORT, json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
+def write_report(folder: Path, report: Mapping[str, Any], name: str = REPORT) -> None:
+    """Writes a report as JSON; numbers that are not finite, as after a divergence, are null."""
+    write_atomically(folder / name, json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
 
 
 def read_report(run_dir: Path) -> dict[str, Any]:
