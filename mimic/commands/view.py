@@ -37,7 +37,6 @@ from mimic.viewer.hand_following import HandSettings
 from mimic.viewer.live_session import RATE, LiveSession
 
 if TYPE_CHECKING:
-    from mimic.trainers.pose_mapper.mapper import PoseMapper
     from mimic.viewer.controls import ExpertControls
     from mimic.viewer.page import Page
     from mimic.viewer.playback import Playback
@@ -138,24 +137,15 @@ def _finish(config: ViewConfig, session: LiveSession) -> None:
 
 
 def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
-    """Prepares a view whose learner a pose mapper moves.
-
-    Raises:
-      ValueError: see `PoseMapper.load`.
-    """
-    mapper = _load_mapper(config)
-    return _prepare_live(config, mapper.env, LiveSession(mapper.env, mapper))
-
-
-def _load_mapper(config: ViewConfig) -> "PoseMapper":
-    """The mapper in `mapper`: a run directory, or the name of one that comes with mimic.
+    """Prepares a view whose learner a pose mapper moves: one of a run directory, or one that comes with mimic.
 
     Raises:
       ValueError: see `given_run` and `PoseMapper.load`.
     """
     from mimic.trainers.pose_mapper.mapper import PoseMapper
 
-    return PoseMapper.load(given_run(config.mapper, "mapper", "pose_mapper")[0], config.checkpoint)
+    mapper = PoseMapper.load(given_run(config.mapper, "mapper", "pose_mapper")[0], config.checkpoint)
+    return _prepare_live(config, mapper.env, LiveSession(mapper.env, mapper))
 
 
 def _prepare_captured(config: ViewConfig) -> Callable[[], int]:

@@ -20,7 +20,6 @@ from mimic.viewer.tracking import (
     Mapper,
     PoseComparison,
     Settings,
-    home_angles,
     initial_settings,
     lock_angles,
     step_towards,
@@ -96,7 +95,7 @@ class LiveSession:
         self._functions = FunctionCache(env, mapper)
         self._lock_angles = lock_angles(env)
         self._lock = threading.RLock()
-        self._angles = {**home_angles(env), **self.settings.locked}  # of all joints of the learner [rad]
+        self._angles = dict(self._lock_angles)  # of all joints of the learner [rad]
         self._pose = np.array(self.expert.home, np.float32)
         self._motion: tuple[np.ndarray, np.ndarray] | None = None  # times [s] and poses [rad] of the expert
         self._time = 0.0  # s, since the start of the motion

@@ -108,15 +108,11 @@ def learner_arm(env: EnvConfig, locked: Mapping[str, float]) -> Arm:
     return build_arm(dataclasses.replace(env.learner, locked=dict(locked)), env.limits, env.metric.links)
 
 
-def home_angles(env: EnvConfig) -> Mapping[str, float]:
-    """Angle of each of the learner's joints in its start pose [rad], base to tip."""
-    free = build_arm(dataclasses.replace(env.learner, locked=()), env.limits).embodiment
-    return dict(zip(free.joint_names, map(float, free.home), strict=True))
-
-
 def lock_angles(env: EnvConfig) -> Mapping[str, float]:
     """Angle at which each of the learner's joints is locked [rad]: that of the config, or else of the start pose."""
-    return {**home_angles(env), **env.build_arm("learner").locked}
+    free = build_arm(dataclasses.replace(env.learner, locked=()), env.limits).embodiment
+    home = dict(zip(free.joint_names, map(float, free.home), strict=True))
+    return {**home, **env.build_arm("learner").locked}
 
 
 def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None = None) -> Iterator[CompiledFunctions]:
