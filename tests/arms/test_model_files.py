@@ -76,8 +76,7 @@ def test_third_party_arms_move_as_in_their_models(x64, name):
 
 @pytest.mark.parametrize(("actuators", "tip"), [("motor", "pinch"), ("position", "palm"), ("none", "wrist_3_link")])
 def test_a_generated_arm_moves_as_in_its_model(x64, tmp_path, actuators, tip):
-    file = tmp_path / "arm.xml"
-    file.write_text(original_model.ur_like(actuators=actuators))
+    file = original_model.ur_file(tmp_path, actuators=actuators)
     kinematic, dynamic = largest_errors(file, mujoco.MjModel.from_xml_path(str(file)), tip)
     assert kinematic < 1e-9 and dynamic < 1e-9
 
@@ -100,8 +99,7 @@ def test_a_urdf_arm_moves_as_in_its_model(x64, tmp_path):
 def test_servos_and_motors_give_the_same_arm(tmp_path):
     arms = []
     for actuators in ("motor", "position"):
-        file = tmp_path / f"{actuators}.xml"
-        file.write_text(original_model.ur_like(actuators=actuators))
+        file = original_model.ur_file(tmp_path, actuators=actuators)
         arms.append(build_arm(ArmConfig(model=str(file))))
     motor, servo = arms
     np.testing.assert_array_equal(motor.embodiment.torque_limit, servo.embodiment.torque_limit)
@@ -112,8 +110,7 @@ def test_servos_and_motors_give_the_same_arm(tmp_path):
 
 
 def test_unnamed_joints_are_named_and_can_be_simulated(tmp_path):
-    file = tmp_path / "nameless.xml"
-    file.write_text(original_model.ur_like(named=False, gripper=""))
+    file = original_model.ur_file(tmp_path, named=False, gripper="")
     arm = build_arm(ArmConfig(model=str(file), locked=["joint2"]))
     assert arm.embodiment.joint_names == ("joint1", "joint3", "joint4", "joint5", "joint6")
     assert arm.model.nq == 5
@@ -121,8 +118,7 @@ def test_unnamed_joints_are_named_and_can_be_simulated(tmp_path):
 
 
 def test_rotor_inertia_and_damping_are_at_least_the_configured_ones(tmp_path):
-    file = tmp_path / "arm.xml"
-    file.write_text(original_model.ur_like(armature=0.02))
+    file = original_model.ur_file(tmp_path, armature=0.02)
     model = build_arm(ArmConfig(model=str(file), armature=0.1, damping=0.1)).model
     assert model.dof_armature.tolist() == [0.1] * 6 and model.dof_damping.tolist() == [0.2] * 6
 

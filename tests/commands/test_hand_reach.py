@@ -18,8 +18,7 @@ from tests.helpers import original_model
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory):
-    file = tmp_path_factory.mktemp("arm") / "arm.xml"
-    file.write_text(original_model.ur_like())
+    file = original_model.ur_file(tmp_path_factory.mktemp("arm"))
     return mimic.build_arm(mimic.ArmConfig(model=str(file)), "hardware")
 
 
@@ -86,8 +85,7 @@ def test_keys_without_effect_and_bad_bases(reason, arguments, message):
 
 @pytest.mark.slow
 def test_no_hand_is_reached_that_is_farther_than_the_arm_is_long(arm, tmp_path):
-    file = tmp_path / "arm.xml"
-    file.write_text(original_model.ur_like())
+    file = original_model.ur_file(tmp_path)
     learner = mimic.ArmConfig()
     reach = hand_reach.hand_reach(mimic.ArmConfig(model=str(file)), learner, MetricConfig(), "auto")
     distance = np.linalg.norm(reach.hands[:, 0] - reach.base[:3], axis=-1)

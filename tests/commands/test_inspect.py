@@ -17,8 +17,7 @@ from tests.helpers.commands import run
 
 @pytest.fixture
 def arm_file(tmp_path):
-    file = tmp_path / "arm.xml"
-    file.write_text(original_model.ur_like(actuators="position"))
+    file = original_model.ur_file(tmp_path, actuators="position")
     return file
 
 
@@ -45,8 +44,7 @@ def test_an_inspection_describes_the_arm(arm_file, tmp_path, monkeypatch):
 
 
 def test_armature_is_suggested_for_an_arm_that_runs_away(tmp_path):
-    file = tmp_path / "light.xml"
-    file.write_text(original_model.ur_like(armature=0.0))
+    file = original_model.ur_file(tmp_path, armature=0.0)
     said = run("inspect", file, "bound=false")
     assert "warning: random torques accelerate a joint to" in said
     (armature,) = re.findall(r"train it: .* 'env.learner.armature={(\S+)}' 'env.learner.damping=\S+", said)
@@ -69,8 +67,7 @@ def test_an_arm_that_is_too_heavy_for_its_torques_is_noted(tmp_path, mass, is_we
 
 def test_joints_that_are_slow_enough_stay_as_they_are(tmp_path):
     """A joint gets rotor inertia only if it exceeds the bound itself, and then no joint does."""
-    file = tmp_path / "light.xml"
-    file.write_text(original_model.ur_like(armature=0.0))
+    file = original_model.ur_file(tmp_path, armature=0.0)
     env, config = EnvConfig(), mimic.ArmConfig(model=str(file), armature={"pan": 0.05})
     arm = mimic.build_arm(config)
     changed, reason = arm_checks.stabilised(config, arm, env)

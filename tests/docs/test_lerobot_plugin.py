@@ -78,8 +78,7 @@ class SimulatedLeader(Teleoperator):
 
 @pytest.fixture
 def options(tmp_path):
-    file = tmp_path / "follower.xml"
-    file.write_text(original_model.ur_like())
+    file = original_model.ur_file(tmp_path)
     return {"leader_model": "panda", "follower_model": str(file), "fps": FPS, "velocity": 3.0, "gripper": [0.0, 0.08]}
 
 

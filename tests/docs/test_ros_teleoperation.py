@@ -40,8 +40,7 @@ def message():
 
 def test_joint_states_of_a_leader_become_commands_of_a_follower(message, tmp_path):
     """The follower waits for its pose; joints arrive in another order, with others, and some messages lack one."""
-    file = tmp_path / "arm.xml"
-    file.write_text(original_model.ur_like())
+    file = original_model.ur_file(tmp_path)
     arm = ros_teleoperation.JointStateFollower("panda", str(file), RATE, hand="relative", velocity=3.0)
     panda, follower = (
         mimic.build_arm(mimic.ArmConfig(model=model), "hardware").embodiment for model in ("panda", str(file))

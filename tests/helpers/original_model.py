@@ -3,6 +3,7 @@
 import os
 import pathlib
 from importlib.util import find_spec
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -43,6 +44,13 @@ def ur_like(*, gripper: str = GRIPPER, actuators: str = "motor", named: bool = T
       <worldbody><geom type="plane" size="1 1 0.1"/><body name="table" pos="0.2 0.1 0.3" euler="0 0 0.5">
         <geom type="box" size="0.1 0.1 0.05"/>{opened}{gripper}{"</body>" * (len(_UR_LIKE) + 1)}
       </worldbody>{coupled}<actuator>{acting}</actuator></mujoco>"""
+
+
+def ur_file(folder: pathlib.Path, **options: Any) -> pathlib.Path:
+    """A file of `ur_like` in a folder."""
+    file = folder / "arm.xml"
+    file.write_text(ur_like(**options))
+    return file
 
 
 def urdf(*, mesh: str = "") -> str:

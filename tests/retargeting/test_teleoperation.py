@@ -284,7 +284,7 @@ def test_arguments_are_checked(arms):
 
 
 def test_flipped_wrists_keep_the_rotation_of_the_hand(arms, tmp_path):
-    (file := tmp_path / "ur.xml").write_text(original_model.ur_like())
+    file = original_model.ur_file(tmp_path)
     arm = mimic.build_arm(mimic.ArmConfig(model=str(file)), "hardware").embodiment
     search, rows = mimic.Teleoperator(arms[0], arm, velocity=3.0)._live._branches, ArmRows(arm)
     flipped = search._flipped(np.array([0.3, -1.2, 1.4, -1.0, -1.2, 0.2]))

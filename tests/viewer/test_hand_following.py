@@ -32,8 +32,7 @@ def panda():
 
 @pytest.fixture(scope="module")
 def env(tmp_path_factory):
-    file = tmp_path_factory.mktemp("arm") / "arm.xml"
-    file.write_text(original_model.ur_like())
+    file = original_model.ur_file(tmp_path_factory.mktemp("arm"))
     return dataclasses.replace(env_config("pair"), learner=ArmConfig(model=str(file)))
 
 
