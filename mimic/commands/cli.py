@@ -171,11 +171,11 @@ def _sweep_run(prepare: Callable[[], Work]) -> Outcome:
     try:
         work = prepare()
     except _BAD_INPUT as error:
-        return _failed_run(error, BAD_INPUT)
+        return Outcome(BAD_INPUT, _print_error(error))
     try:
         exit_code = work() or 0
     except OSError as error:
-        return _failed_run(error, FAILED)
+        return Outcome(FAILED, _print_error(error))
     except Exception as error:
         traceback.print_exc()
         return Outcome(FAILED, " ".join(f"{type(error).__name__}: {error}".split()))
@@ -212,10 +212,6 @@ def _key_of_nothing(arguments: Sequence[str]) -> str:
             if argument.lstrip("+~").startswith((f"{part}.", f"{part}={{")):
                 return f"{argument.partition('=')[0]}: expected with {advice}; {part} is null"
     return ""
-
-
-def _failed_run(error: BaseException, exit_code: int) -> Outcome:
-    return Outcome(exit_code, _print_error(error))
 
 
 def _exit_with_error(error: BaseException, exit_code: int = BAD_INPUT) -> NoReturn:
