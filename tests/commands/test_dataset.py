@@ -20,9 +20,9 @@ from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.labels import SPLITS
 from mimic.motions.formats.episodes import ANGLE, VELOCITY
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.config import PoseMapperConfig, TrainConfig
-from mimic.trainers.run_config import load_config, save_config
+from mimic.trainers.run_config import load_config
 from tests.helpers.commands import run
+from tests.helpers.run_directories import write_run
 from tests.helpers.untrained_run import COUNT, HELD_OUT, HORIZON, environment, untrained_run
 
 pq = pytest.importorskip("pyarrow.parquet")
@@ -239,9 +239,8 @@ def test_bad_input_of_the_command(reason, recorded, run_dir, arguments, message)
 
 
 def test_runs_of_another_trainer_are_rejected(reason, tmp_path):
-    (tmp_path / "mapper").mkdir()
-    save_config(tmp_path / "mapper", TrainConfig(mimic.env_config("planar4dof"), PoseMapperConfig().resolve()))
-    line = reason("dataset", f"run={tmp_path / 'mapper'}", "out=new", "compilation_cache=")
+    run_dir = write_run(tmp_path / "mapper", [0.1], trainer="pose_mapper")
+    line = reason("dataset", f"run={run_dir}", "out=new", "compilation_cache=")
     assert "expected a run of trainer=ppo, got one of pose_mapper" in line
 
 

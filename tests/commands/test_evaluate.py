@@ -20,11 +20,11 @@ from mimic.motions.experts import KINDS
 from mimic.physics import step as physics
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.runs.signals import Signals
-from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer
 from mimic.trainers.ppo import ppo
 from mimic.trainers.ppo.trainer import PPOTrainer
-from mimic.trainers.run_config import save_config
+from tests.helpers.run_directories import write_run
 from tests.helpers.untrained_run import COUNT, HELD_OUT, HORIZON, environment, untrained_run
 
 
@@ -180,15 +180,13 @@ def test_a_training_names_the_key_of_what_is_no_run(reason, key):
 
 
 def test_a_run_of_braxs_loop_is_not_resumed(reason, tmp_path):
-    (tmp_path / "run").mkdir()
-    trainer = PPOConfig(loop="brax", final_learning_rate=1.0, final_entropy_cost=1.0, privileged_critic=False)
-    save_config(tmp_path / "run", TrainConfig(environment(), trainer))
-    assert "saves no training state" in reason("train", f"resume={tmp_path / 'run'}", "compilation_cache=")
+    trainer = {"loop": "brax", "final_learning_rate": 1.0, "final_entropy_cost": 1.0, "privileged_critic": False}
+    run_dir = write_run(tmp_path / "run", [0.1], **trainer)
+    assert "saves no training state" in reason("train", f"resume={run_dir}", "compilation_cache=")
 
 
 def test_a_mapper_has_no_controllers(reason, tmp_path):
-    (tmp_path / "run").mkdir()
-    save_config(tmp_path / "run", TrainConfig(environment(), PoseMapperConfig()))
-    save_checkpoint(tmp_path / "run", 0, {"weight": np.zeros(1, np.float32)})
-    error = reason("evaluate", f"run={tmp_path / 'run'}", "controller=pd", "compilation_cache=")
+    run_dir = write_run(tmp_path / "run", [0.1], trainer="pose_mapper")
+    save_checkpoint(run_dir, 0, {"weight": np.zeros(1, np.float32)})
+    error = reason("evaluate", f"run={run_dir}", "controller=pd", "compilation_cache=")
     assert "expected a run of trainer=ppo, got one of pose_mapper" in error

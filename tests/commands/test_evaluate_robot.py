@@ -25,13 +25,14 @@ from mimic.deploy.safety import INTERVENTIONS
 from mimic.envs.world_env import SENT_ACTIONS, control_observation
 from mimic.evaluation.virtual_robot.episodes import Episodes
 from mimic.runs.checkpoints import load_checkpoint, save_checkpoint
-from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.export.config import ExportConfig
 from mimic.trainers.export.export import prepare_export
 from mimic.trainers.export.export_controller import expert_table, prepare_controller
 from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.ppo.ppo import make_controller
 from mimic.trainers.run_config import load_config, save_config
+from tests.helpers.run_directories import write_run
 from tests.helpers.untrained_run import untrained_run
 
 pytest.importorskip("onnxruntime")
@@ -222,10 +223,9 @@ def test_what_does_not_fit_is_rejected(reason, hardware_run, arguments, message)
 
 
 def test_a_mapper_has_no_robot(reason, tmp_path):
-    (tmp_path / "run").mkdir()
-    save_config(tmp_path / "run", TrainConfig(mimic.env_config("panda4dof"), PoseMapperConfig()))
-    save_checkpoint(tmp_path / "run", 0, {"weight": np.zeros(1, np.float32)})
-    error = reason("evaluate", f"run={tmp_path / 'run'}", "robot=virtual_panda", "compilation_cache=")
+    run_dir = write_run(tmp_path / "run", [0.1], "panda4dof", trainer="pose_mapper")
+    save_checkpoint(run_dir, 0, {"weight": np.zeros(1, np.float32)})
+    error = reason("evaluate", f"run={run_dir}", "robot=virtual_panda", "compilation_cache=")
     assert "robot: expected a run of trainer=ppo with one learner" in error
 
 

@@ -51,7 +51,6 @@ def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["env=planar4dof"], "expected a data set or a file of demonstrations"),
         (["source={recorded}", "env=planar4dof", "out=new", "units=deg"], "joints, topic, units, rate: expected none"),
         (["source=none.csv", "hand=firm"], "hand: expected one of exact, near, scaled"),
         (["source=none.csv", "base=[1,2]"], "base: expected same, auto or [x,y,z,yaw], got [1, 2]"),

@@ -53,11 +53,9 @@ def slurm(tmp_path):
     return {**os.environ, "PATH": f"{programs}:{os.environ['PATH']}", "SLURM_STAND_IN": str(tmp_path)}
 
 
-@pytest.mark.slow_for("basic", "submitit_slurm")
+@pytest.mark.slow
 # Any command can be swept, and this one is quick: collecting a folder with a run, and one that is not there.
-@pytest.mark.parametrize(
-    "launcher", ["submitit_slurm", *(pytest.param(name, marks=pytest.mark.slow) for name in ("submitit_local", "ray"))]
-)
+@pytest.mark.parametrize("launcher", ["submitit_slurm", "submitit_local", "ray"])
 def test_a_failed_run_is_named_and_the_rest_is_kept(launcher, tmp_path, slurm):
     if launcher == "ray":
         pytest.importorskip("ray")
