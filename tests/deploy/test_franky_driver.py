@@ -144,10 +144,17 @@ def bundle(tmp_path_factory):
     return bundles.make_bundle(tmp_path_factory.mktemp("bundles") / "bundle", ticks=10)
 
 
-def test_a_motion_is_run(bundle):
+def test_a_motion_is_run(bundle, monkeypatch):
+    """Each motion goes to the end of its command's path, and without another command to the stop that was checked."""
     module = library(bundle.start_pose)
     driver = FrankyDriver("192.0.2.1", bundle, library=module)
-    robot = module.robot
+    robot, commands, write = module.robot, [], driver.write
+
+    def note(command):
+        commands.append(command)
+        write(command)
+
+    monkeypatch.setattr(driver, "write", note)
     report = run_controller(driver, bundle, clock=robot)
     assert report.is_complete and report.ticks == 10 and not robot.is_in_control
     *motions, last = robot.moves
@@ -163,20 +170,7 @@ def test_a_motion_is_run(bundle):
     positions = np.array([end.target.position for end in ends])
     assert np.ptp(positions, axis=0).min() > 0.02 and np.abs(ends[5].target.velocity).max() > 0.1
     np.testing.assert_array_equal(positions[-1], motions[9].waypoints[1].target.position)  # it stops where it must
-
-
-def test_a_robot_without_commands_stops_where_the_path_was_checked(bundle, monkeypatch):
-    module = library(bundle.start_pose)
-    driver = FrankyDriver("192.0.2.1", bundle, library=module)
-    commands, write = [], driver.write
-
-    def note(command):
-        commands.append(command)
-        write(command)
-
-    monkeypatch.setattr(driver, "write", note)
-    run_controller(driver, bundle, clock=module.robot)
-    for command, motion in zip(commands, module.robot.moves, strict=False):
+    for command, motion in zip(commands, motions, strict=True):
         end, stop = motion.waypoints
         np.testing.assert_array_equal([end.target.position, end.target.velocity], [command.qpos, command.qvel])
         np.testing.assert_array_equal(stop.target.position, command.stop)

@@ -60,13 +60,6 @@ def test_a_paused_player_computes_nothing(clip):
     assert player.advance(0.1) == (None, False)
 
 
-def test_a_player_that_does_not_repeat_ends_at_the_last_pose(clip):
-    player = ClipPlayer(clip)
-    player.timeline.repeats = False
-    last = [pose for pose, _ in (player.advance(0.3) for _ in range(10)) if pose is not None][-1]
-    assert last[0] == pytest.approx(6.0) and not player.timeline.is_playing
-
-
 class Listener:
     """Samples that are taken one by one."""
 
