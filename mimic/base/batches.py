@@ -35,7 +35,7 @@ def over_batch(function: Callable[..., Any], *arguments: Any, axes: int) -> Any:
 
 
 def floats(values: ArrayLike, name: str) -> Any:
-    """The values as floating-point numbers of 32 bits or more: a NumPy array, which no device gets, or a JAX array.
+    """The values as floating-point numbers of 32 bits or more: a JAX array where they are one, else a NumPy array.
 
     Raises:
       ValueError: rows of different lengths, or entries that are no real numbers.

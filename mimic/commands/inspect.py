@@ -88,9 +88,9 @@ def _inspect(
         "joints": _joints(learner, config.learner, env),
         "links": _links(expert, learner, env),
         "ends": [with_full_keys(end.reason, "learner") for end in learner.ends],
-        "set_aside": list(learner.notes),
+        "ignored": list(learner.notes),
         "assumed": list(arm_checks.assumptions(config.learner, learner)),
-        "mind": [
+        "warnings": [
             *arm_checks.hand_doubts("expert", expert),
             *arm_checks.warnings(config.learner, learner),
             *([reason] if reason else []),
@@ -110,7 +110,7 @@ def _print(
     say(console, _headline(expert, learner))
     console.print(_table(f"joints of {results['arm']}", results["joints"]))
     console.print(_table("links, and the expert links that they are compared with", results["links"]))
-    for label, key in (("ends at", "ends"), ("ignored", "set_aside"), ("assumed", "assumed"), ("warning", "mind")):
+    for label, key in (("ends at", "ends"), ("ignored", "ignored"), ("assumed", "assumed"), ("warning", "warnings")):
         say(console, *(f"{label}: {line}" for line in results[key]))
     if results["similarity"] is not None:
         say(console, _distance_line(results))
