@@ -9,6 +9,7 @@ contains is not repeated, so that an interrupted study can be continued. Prints 
 """
 
 import csv
+import itertools
 import json
 import os
 import sys
@@ -34,6 +35,7 @@ from mimic.motions.recording import record_demonstrations
 from mimic.runs.files import REPORT
 
 STUDY = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
+LOCKS = [locks for count in range(3, 7) for locks in itertools.combinations("1234567", count)]
 UNSEEN_SEED, UNSEEN, UNSEEN_FILE = 1000, 32, "unseen.npz"  # demonstrations that no run is trained on
 
 
@@ -56,7 +58,7 @@ class Case(NamedTuple):
 
 
 def cases(preset: str) -> list[Case]:
-    extent = STUDY["presets"][preset]
+    extent = {**STUDY["presets"][preset], "locks": ",".join(map("+".join, LOCKS))}
     return [
         Case(group, name.format(**values), f"{settings} {arguments}".format(**extent, **values).split(), seeds)
         for group, named in STUDY["cases"].items()

@@ -50,21 +50,19 @@ def unseen_arms(results: Results) -> list[Cells]:
     return rows
 
 
-GROUPS = {
-    "seen locks": "Pandas with no, one or two joints locked, as in training",
-    "unseen locks": "8 sets of locked joints that are not in the training",
-    "seven real arms": "7 real arms that are not in the training",
-    "random arms": "random arms that are not in the training",
-}
-
-
-def any_arm_policy(results: Results) -> list[Cells]:
-    rows: list[Cells] = [("arms", "controller, no training", "one policy, three seeds", "arms on which it is better")]
-    for group, entry in results["groups"].items():
-        better = [seed["better_than_the_controller"] for seed in entry["seeds"]]
-        gaps = span([seed["mean"] for seed in entry["seeds"]])
-        count = f"{span(better, 'd', 1)} of {entry['arms']}"
-        rows.append((GROUPS[group], percent(entry["controller"]["mean"]), f"{gaps} %", count))
+def locked_arms(results: Results) -> list[Cells]:
+    """Gaps of one policy and of the controller without learning by number of locked joints, of arms that have a gap."""
+    (run,) = results["results"]["panda_family"]
+    rows: list[Cells] = [
+        ("locked joints", "arms", "controller, no training: mean, largest gap [%]", "policy: mean, largest gap [%]")
+    ]
+    for seen, label in ((True, "in training"), (False, "not in training")):
+        of_split = [arm for arm in run["arms"].values() if arm["seen"] == seen and arm["gap"] is not None]
+        for joints in sorted({arm["joints"] for arm in of_split}, reverse=True):
+            arms = [arm for arm in of_split if arm["joints"] == joints]
+            gaps = [[100 * arm[key] for arm in arms] for key in ("controller_gap", "gap")]
+            cells = (f"{statistics.fmean(values):.2f}, {max(values):.2f}" for values in gaps)
+            rows.append((f"{7 - joints}, {label}", str(len(arms)), *cells))
     return rows
 
 

@@ -58,7 +58,7 @@ def simulations(paper: Results, others: Results) -> list[Cells]:
     ]
     cases = [("one_demonstration", "7 to 7", "1"), *((env, joints, "124") for env, joints in ENVIRONMENTS.items())]
     for case, joints, count in cases:
-        gaps = [row["optimality_gap"] for row in where(paper["rows"], case=case)]
+        gaps = [run["optimality_gap"] for run in paper["results"][f"{case}-paper"]]
         of_others = [row["gap"] for row in where(others["rows"], task=case)]
         values = ([100 * of_seed[split] for of_seed in seeds] for seeds in (gaps, of_others) for split in SPLITS)
         rows.append((joints, count, *(f"{statistics.fmean(x):.2f} ± {statistics.stdev(x):.2f}" for x in values)))
