@@ -73,8 +73,8 @@ def test_the_bound_is_that_of_the_arm_compiled_in(batch, row):
     expected = np.asarray(mimic.kinematic_bound(expert, learner, *MOTION, **metric))
     actual = batch[1].distance[row]
     # Both are results of a search, from other random poses; here both find the same poses. What is left is how near
-    # velocities come to kinks: 2e-6, and 1.4e-4 without their refinement.
-    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-5)
+    # velocities come to kinks: 2e-6 to 2e-5 by processor, and 1.4e-4 without their refinement.
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=5e-5)
     assert np.all(actual <= 1.01 * expected)
 
 
