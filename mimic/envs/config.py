@@ -77,8 +77,8 @@ class ObservationConfig:
 
     Attributes:
       terms: names of observation terms, in the order of their numbers, after the link states: "distance_gradient",
-        which is built in, or what `mimic.register` adds; an empty list is the paper's. Null is "distance_gradient" in
-        an environment of the kind "one_arm", and nothing in others.
+        which is built in, or what `mimic.register` adds; an empty list is the paper's. Null is the same, but in a
+        training what its preset observes (mimic/trainers/presets.py).
     """
 
     terms: list[str] | None = None
@@ -233,9 +233,7 @@ class EnvConfig:
     @property
     def observed_terms(self) -> list[str]:
         """Names of the observation terms."""
-        if self.observation.terms is None:
-            return list(OBSERVATION_TERMS) if self.kind == "one_arm" else []
-        return self.observation.terms
+        return self.observation.terms or []
 
     @property
     def recording_substeps(self) -> int:

@@ -33,7 +33,8 @@ TOLERANCE = 1e-5  # rad, or a fraction of the maximum torque: float32, sums in a
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
     """The environment and the policy of a run with random weights and observation statistics, and its export."""
-    env = mimic.make("panda4dof", demonstrations={"count": 1, "held_out": 1})
+    terms = {"terms": ["distance_gradient"]}
+    env = mimic.make("panda4dof", demonstrations={"count": 1, "held_out": 1}, observation=terms)
     run_dir = untrained_run(tmp_path_factory.mktemp("policy") / "run", env.config)
     config = load_config(run_dir).trainer
     networks = make_networks(config, env.observation_size, env.action_size, env.privileged_size)
