@@ -27,8 +27,8 @@ def test_presets_follow_the_backend_and_the_environment():
 
 
 def test_a_preset_chooses_what_is_observed_where_the_user_does_not():
-    def observed(backend, env, trainer=PPOConfig()):
-        return TrainConfig(env, trainer).resolve(backend).env.observation.terms
+    def observed(backend, env, trainer=None):
+        return TrainConfig(env, trainer or PPOConfig()).resolve(backend).env.observation.terms
 
     panda, gradient = mimic.env_config("panda4dof"), ["distance_gradient"]
     assert observed("gpu", panda) == observed("cpu", panda, PPOConfig(preset="gpu")) == gradient
