@@ -19,9 +19,9 @@ from tests.helpers.untrained_run import untrained_run
 
 
 def test_the_command_names_what_differs_from_the_defaults():
-    trainer = PPOConfig(preset="cpu", num_timesteps=1000, hidden_layers=[8]).resolve()
+    trainer = PPOConfig(preset="cpu", num_timesteps=1000, hidden_layers=[8])
     config = TrainConfig(env_config("planar4dof", physics="fused"), trainer, seed=3, run_dir="runs/x")
-    assert shlex.split(pretrained.training_command(config)) == [
+    assert shlex.split(pretrained.training_command(config.resolve())) == [
         *("python", "-m", "mimic.train", "env=planar4dof", "trainer=ppo", "trainer.preset=cpu"),
         *("env.physics=fused", "trainer.num_timesteps=1000", "trainer.hidden_layers=[8]", "seed=3"),
     ]
