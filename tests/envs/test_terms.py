@@ -63,7 +63,7 @@ def test_terms_are_added(terms):
 
 @pytest.mark.slow
 def test_the_distance_gradient_is_that_of_finite_differences():
-    env = mimic.make("panda4dof", physics="fused", **SMALL)  # it is a term by default
+    env = mimic.make("panda4dof", physics="fused", observation={"terms": ["distance_gradient"]}, **SMALL)
     state = one_step(env, jnp.linspace(-0.5, 0.8, env.action_size)).pipeline_state
     observed = np.asarray(jax.jit(env.observe)(state)[-2 * env.action_size :])
     n, next_step = env.action_size, state.step + 1
