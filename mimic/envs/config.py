@@ -77,8 +77,8 @@ class ObservationConfig:
 
     Attributes:
       terms: names of observation terms, in the order of their numbers, after the link states: "distance_gradient",
-        which is built in, or what `mimic.register` adds; an empty list is the paper's. Null is the same, but in a
-        training what its preset observes (mimic/trainers/presets.py).
+        which is built in, or what `mimic.register` adds; an empty list is the paper's. Null is an empty list, but
+        in a training the terms of the preset (`OBSERVED_TERMS`).
     """
 
     terms: list[str] | None = None

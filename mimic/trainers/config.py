@@ -350,8 +350,8 @@ class TrainConfig:
     def resolve(self, backend: str = "cpu", devices: int = 1) -> Self:
         """The config with a resolved trainer, see `TrainerConfig.resolve`, and with the terms that it observes."""
         env, trainer = self.env, self.trainer.resolve(backend, devices, env=self.env)
-        is_open = env.kind == "one_arm" and not env.environment and env.observation.terms is None
-        if is_open and isinstance(trainer, PPOConfig):
+        has_preset_terms = env.kind == "one_arm" and not env.environment and isinstance(trainer, PPOConfig)
+        if has_preset_terms and env.observation.terms is None:
             observed = ObservationConfig(OBSERVED_TERMS.get(trainer.preset, []))
             env = dataclasses.replace(env, observation=observed)
         return dataclasses.replace(self, env=env, trainer=trainer)
