@@ -23,11 +23,9 @@ from benchmarks.common.record import Row, collect, failure
 from benchmarks.common.timing import summary_of_rates
 from benchmarks.peers import stock
 from mimic.base import compat
-from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import wrap_for_training
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo.ppo import compile_training
-from mimic.trainers.presets import OBSERVED_TERMS
 
 EPOCHS = 6  # the first compiles
 SETTINGS = (  # that brax's PPO has under the same names
@@ -51,13 +49,8 @@ def settings(config: PPOConfig) -> dict[str, Any]:
     return {name: getattr(config, name) for name in SETTINGS}
 
 
-def environment(name: str, physics: str, config: PPOConfig) -> ImitationEnv:
-    """The environment with what a training by these settings observes."""
-    return mimic.make(name, physics=physics, observation={"terms": OBSERVED_TERMS.get(config.preset, [])})
-
-
 def mimic_loop(physics: str, name: str, config: PPOConfig, batches: int) -> dict[str, float]:
-    env = environment(name, physics, config)
+    env = mimic.make(name, physics=physics)
     times = [time.perf_counter()]
     start, _, epoch = compile_training(env, config, batches)
     state = start(0)
@@ -71,7 +64,7 @@ def mimic_loop(physics: str, name: str, config: PPOConfig, batches: int) -> dict
 def brax_loop(physics: str, name: str, config: PPOConfig, batches: int) -> dict[str, float]:
     """Brax's own training loop, on the environment, or with "stock" on the stock one."""
     compat.mend_brax()
-    imitation = environment(name, "mjx" if physics == "stock" else physics, config)
+    imitation = mimic.make(name, physics="mjx" if physics == "stock" else physics)
     env, wrap = (stock.StockEnv(imitation), stock.wrap) if physics == "stock" else (imitation, wrap_for_training)
     hidden = {f"{network}_hidden_layer_sizes": tuple(config.hidden_layers) for network in ("policy", "value")}
     times = [time.perf_counter()]

@@ -18,7 +18,6 @@ from mimic.base.files import open_file
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_report
 from mimic.envs import EnvConfig, env_config
-from mimic.envs.config import ObservationConfig
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.make import make_env
 from mimic.envs.many_arms import AnyArmEnv
@@ -171,7 +170,7 @@ def _env_config(env: str | EnvConfig | ImitationEnv, overrides: Mapping[str, Any
             f"env: expected the name of {type(env).__name__}: a run makes its environment from its config; "
             "register the class with mimic.register('environment', NAME, CLASS), and fit NAME"
         )
-    return dataclasses.replace(env.config, observation=ObservationConfig(env.config.observed_terms))  # no preset's
+    return env.config
 
 
 def _check_demonstrations(env: ImitationEnv) -> None:

@@ -14,9 +14,8 @@ from mimic.motions.experts import KINDS, MIXED
 from mimic.physics.world import AUTO, PHYSICS, WorldConfig
 
 Kind = Literal["one_arm", "inner_loop", "sampled_arms"]
-REWARD_TERMS, OBSERVATION_TERMS = ("self_collision",), ("distance_gradient",)  # built in, see mimic/envs/terms.py
+REWARD_TERMS = ("self_collision",)  # built in, see mimic/envs/terms.py
 registry.reserve("reward_term", REWARD_TERMS)
-registry.reserve("observation_term", OBSERVATION_TERMS)
 _RECORDING_TIMESTEP = 0.01  # s, of the physics of an expert in an environment with an inner loop
 _MAX_RECORDED_STEPS = 10**8  # an hour on two cores
 
@@ -76,16 +75,14 @@ class ObservationConfig:
     """What is added to the observation, see `mimic.register`.
 
     Attributes:
-      terms: names of observation terms, in the order of their numbers, after the link states: "distance_gradient",
-        which is built in, or what `mimic.register` adds; an empty list is the paper's. Null is an empty list, but
-        in a training the terms of the preset (`OBSERVED_TERMS`).
+      terms: names of observation terms that `mimic.register` adds, in the order of their numbers, after the link
+        states.
     """
 
-    terms: list[str] | None = None
+    terms: list[str] = dataclasses.field(default_factory=list)
 
     def __post_init__(self) -> None:
-        terms = self.terms or []
-        repeated = sorted({name for name in terms if terms.count(name) > 1})
+        repeated = sorted({name for name in self.terms if self.terms.count(name) > 1})
         if repeated:
             raise ValueError(f"observation.terms: expected each term once, got {repeated[0]!r:.80} twice")
 
@@ -196,7 +193,7 @@ class EnvConfig:
         self._check_applies()
         for name in self.reward.terms:
             registry.check("reward_term", name, "reward.terms")
-        for name in self.observed_terms:
+        for name in self.observation.terms:
             registry.check("observation_term", name, "observation.terms")
         if self.environment:
             registry.check("environment", self.environment, "environment")
@@ -229,11 +226,6 @@ class EnvConfig:
         if self.arms is not None:
             return "sampled_arms"
         return "one_arm" if self.world is None else "inner_loop"
-
-    @property
-    def observed_terms(self) -> list[str]:
-        """Names of the observation terms."""
-        return self.observation.terms or []
 
     @property
     def recording_substeps(self) -> int:

@@ -24,7 +24,7 @@ from mimic.arms.drives import drives_of
 from mimic.arms.embodiment import Embodiment
 from mimic.base import compat, registry
 from mimic.envs.arm_state import ArmState, arm_state
-from mimic.envs.config import OBSERVATION_TERMS, EnvConfig
+from mimic.envs.config import EnvConfig
 from mimic.envs.start_poses import start_poses
 from mimic.envs.terms import ObservationTerm, Transition, observation_terms, observed, reward_terms
 from mimic.metric.capsule_distances import changing_pairs
@@ -84,7 +84,7 @@ class ImitationEnv(Env):
         compat.mend_brax()  # here: brax's trainers take any environment, wrapped by any function
         self.config = config
         self.reward_terms = reward_terms(config.reward.terms)
-        self.observation_terms = observation_terms(config.observed_terms)
+        self.observation_terms = observation_terms(config.observation.terms)
         expert = self._set_arms()
         self.held_out: Demonstrations | None = None
         if demonstrations is None:
@@ -327,7 +327,7 @@ class ImitationEnv(Env):
     def observe(self, state: ArmState) -> Float[Array, " observation"]:
         """The observation: the learner's link states, then the expert's now and at each of the next `preview` steps.
 
-        Sines, cosines and velocities of the learner's joints follow, then the config's `observed_terms`.
+        Sines, cosines and velocities of the learner's joints follow, then the config's `observation.terms`.
 
         A subclass may override it: every observation of the environment is then the subclass's.
         """
@@ -467,10 +467,7 @@ def observation_layout(
             parts.append((f"{arm_name}: hand x- and z-axes", [2 * len(arm.hand_joint), 3], "1"))
     of_joints = ("sines of the angles", "1"), ("cosines of the angles", "1"), ("joint velocities", "rad/s")
     parts += [(f"learner: {name}", [learner.num_joints], unit) for name, unit in of_joints]
-    for name, size in terms.items():
-        by = (("angles", "1/rad"), ("joint velocities", "s/rad")) if name in OBSERVATION_TERMS else ()
-        parts += [(f"{name}: by the learner's {values}", [size // 2], unit) for values, unit in by]
-        parts += [] if by else [(f"term: {name}", [size], "")]
+    parts += [(f"term: {name}", [size], "") for name, size in terms.items()]
     return _laid_out(parts)
 
 

@@ -9,11 +9,10 @@ from jaxtyping import Array, Float
 
 from mimic.base import registry
 from mimic.envs.arm_state import ArmState
-from mimic.envs.config import OBSERVATION_TERMS, REWARD_TERMS
+from mimic.envs.config import REWARD_TERMS
 from mimic.envs.start_poses import CLEARANCE
 from mimic.metric.capsule_distances import capsule_axes, intrusion, pair_distances
 from mimic.metric.kinematics import LinkStates, link_states
-from mimic.metric.motion_distance import gradient_by_learner
 
 Env = Any  # an `ImitationEnv`, which imports this module
 
@@ -115,27 +114,9 @@ def reward_terms(weights: Mapping[str, float]) -> tuple[WeightedTerm, ...]:
     )
 
 
-def distance_gradient(env: Env, state: ArmState) -> Float[Array, " 2*joints"]:
-    """Gradient of the embodiment distance to the expert one step ahead: by joint angles [1/rad], then speeds [s/rad].
-
-    It says which way each joint should move. Without it a policy learns the kinematics of the learner from rewards.
-    """
-    expert_states = env.expert_at(state.demonstration, state.step + 1)
-    return gradient_by_learner(env.metric, env.learner, expert_states, state.qpos, state.qvel)
-
-
-_BUILT_IN_OBSERVATION_TERMS: dict[str, ObservationTerm] = dict(
-    zip(OBSERVATION_TERMS, (distance_gradient,), strict=True)
-)
-
-
 def observation_terms(names: Sequence[str]) -> tuple[tuple[str, ObservationTerm], ...]:
     """The terms of `observation.terms`. Raises a ValueError for an unknown name."""
-    found = (
-        _BUILT_IN_OBSERVATION_TERMS.get(name) or registry.find("observation_term", name, "observation.terms")
-        for name in names
-    )
-    return tuple(zip(names, found, strict=True))
+    return tuple((name, registry.find("observation_term", name, "observation.terms")) for name in names)
 
 
 def observed(name: str, term: ObservationTerm, env: Env, state: ArmState) -> Float[Array, " numbers"]:

@@ -246,8 +246,8 @@ def _check(config: EnvConfig) -> None:
             f"world.action_latency: expected a multiple of {PERIOD} s below control_dt = {config.control_dt} s, got "
             f"{latency}"
         )
-    if config.observed_terms:
-        raise ValueError(f"observation.terms: expected none with an inner loop, got {config.observed_terms}")
+    if config.observation.terms:
+        raise ValueError(f"observation.terms: expected none with an inner loop, got {config.observation.terms}")
 
 
 def _pushed(history: Float[Array, "ticks numbers"], newest: Float[Array, " numbers"]) -> Float[Array, "ticks numbers"]:

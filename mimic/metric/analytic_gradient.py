@@ -77,54 +77,6 @@ def distance_and_gradient(
     return [[value], *(gradients[k] for k in arguments)]
 
 
-def gradient_by_states(
-    learner: Embodiment,
-    factors: Float[np.ndarray, "parts rows learner_rows"],
-    expert: Sequence[Scalar],
-    qpos: Sequence[Scalar],
-    qvel: Sequence[Scalar],
-) -> list[list[Scalar]]:
-    """The gradient of the distance to states of an expert by the states of the learner's rows.
-
-    Args:
-      learner: in units of its chain length.
-      factors: see `distance_and_gradient`.
-      expert: normalized states of the expert's rows, one after the other: the components of `LinkVectors`.
-      qpos: of the learner [rad].
-      qvel: likewise [rad/s].
-    """
-    _, links = _learner_rows(learner, factors, qpos, qvel)
-    _, (_, gradients) = _compare(factors, _as_vectors(expert), links)
-    return [[component for row in gradients for vector in row for component in vector]]
-
-
-def gradient_by_motion(
-    learner: Embodiment,
-    factors: Float[np.ndarray, "parts rows learner_rows"],
-    gradients: Sequence[Scalar],
-    qpos: Sequence[Scalar],
-    qvel: Sequence[Scalar],
-) -> list[list[Scalar]]:
-    """The gradient by the learner's qpos, then by its qvel, from that by states. Arguments: `gradient_by_states`."""
-    frames, links = _learner_rows(learner, factors, qpos, qvel)
-    by_qpos, by_qvel = _by_joints(learner, frames, links, _as_vectors(gradients))
-    return [by_qpos + by_qvel]
-
-
-def _learner_rows(
-    learner: Embodiment, factors: np.ndarray, qpos: Sequence[Scalar], qvel: Sequence[Scalar]
-) -> tuple[list[JointFrame], list[LinkVectors]]:
-    """Joint frames, and states of the links and, where `factors` has rows for them, of each axis of the hands."""
-    frames = joint_frames(learner, qpos, qvel)
-    links = link_vectors(learner, frames)
-    return frames, links + hand_vectors(learner, frames) if factors.shape[2] > len(links) else links
-
-
-def _as_vectors(components: Sequence[Scalar]) -> list[LinkVectors]:
-    vectors = [(components[k], components[k + 1], components[k + 2]) for k in range(0, len(components), 3)]
-    return [LinkVectors(*vectors[k : k + 4]) for k in range(0, len(vectors), 4)]
-
-
 def _compare(
     factors: Float[np.ndarray, "parts rows learner_rows"], expert: list[LinkVectors], learner: list[LinkVectors]
 ) -> tuple[Scalar, list[list[LinkVectors]]]:

@@ -15,7 +15,6 @@ from mimic.arms.arrays import ArmArrays
 from mimic.arms.embodiment import LONG, Embodiment, in_chain_lengths
 from mimic.base import fused_kernel
 from mimic.base.batches import over_batch
-from mimic.base.compilation import by_value
 from mimic.metric import analytic_gradient
 from mimic.metric.distance import (
     PAPER_WEIGHTS,
@@ -26,7 +25,7 @@ from mimic.metric.distance import (
     Weights,
 )
 from mimic.metric.hand import NO_HAND, HandWeights
-from mimic.metric.kinematics import LinkStates, joint_values, link_states
+from mimic.metric.kinematics import joint_values, link_states
 
 Values = Callable[..., tuple[Array, ...]]  # motions -> distance, gradients
 MotionDistance = Callable[..., Float[Array, ""]]  # expert_qpos, expert_qvel, learner_qpos, learner_qvel
@@ -97,72 +96,6 @@ def motion_distance(
         return over_batch(distance, *(values.astype(dtype) for values in motion), axes=1)
 
     return of_motions
-
-
-def gradient_by_learner(
-    metric: Metric,
-    learner: Embodiment | ArmArrays,
-    expert_states: LinkStates,
-    qpos: Float[Array, " joints"],
-    qvel: Float[Array, " joints"],
-) -> Float[Array, " 2*joints"]:
-    """Gradient of the distance to states of the expert, by the learner's angles [1/rad], then its speeds [s/rad].
-
-    In closed form where `motion_distance` has one, else by automatic differentiation; 0 where that is not finite, as of
-    the norm of two positions that match.
-
-    Args:
-      metric: between the two arms.
-      learner: its embodiment.
-      expert_states: normalized link states of the expert.
-      qpos: the learner's joint angles [rad].
-      qvel: its joint velocities [rad/s].
-    """
-    has_closed_form = metric.is_static and _is_constant((learner, metric.arguments)) and learner.num_joints <= LONG
-    if isinstance(learner, Embodiment) and has_closed_form and expert_states.direction is not None:
-        hands = 0 if expert_states.hand is None else len(expert_states.hand.position)
-        factors = np.asarray(metric.factors(hands, len(learner.hand_joint)), float)
-        arm = in_chain_lengths(_as_numpy(learner))
-        return _gradient_in_stages(arm, factors)(_rows(expert_states, factors.shape[1]), qpos, qvel)[0]
-
-    def distance(qpos: Array, qvel: Array) -> Array:
-        return metric(expert_states, link_states(learner, qpos, qvel))
-
-    gradient = jnp.concatenate(jax.grad(distance, argnums=(0, 1))(qpos, qvel))
-    return jnp.where(jnp.isfinite(gradient), gradient, 0)
-
-
-@by_value
-def _gradient_in_stages(learner: Embodiment, factors: np.ndarray) -> Callable[..., tuple[Array, ...]]:
-    """The gradient as a function of `_rows`, qpos and qvel; two kernels on a GPU: one compiles half as fast.
-
-    JAX traces the same function once for all callers, which takes seconds.
-    """
-    by_states, by_motion = (
-        functools.partial(stage, learner, factors)
-        for stage in (analytic_gradient.gradient_by_states, analytic_gradient.gradient_by_motion)
-    )
-    first = fused_kernel.gpu_kernel(by_states, [12 * factors.shape[2]])
-    second = fused_kernel.gpu_kernel(by_motion, [2 * learner.num_joints])
-
-    def of_sample(*vectors: Array) -> tuple[Array, ...]:
-        rows, *motion = ([vector[k] for k in range(vector.shape[0])] for vector in vectors)
-        (gradient,) = by_motion(by_states(rows, *motion)[0], *motion)
-        return (jnp.stack([jnp.asarray(x, vectors[0].dtype) for x in gradient]),)
-
-    return jax.jit(fused_kernel.batched_by(lambda rows, *motion: second(*first(rows, *motion), *motion), of_sample))
-
-
-def _rows(states: LinkStates, count: int) -> Float[Array, " components"]:
-    """The components of `LinkVectors` of each link and, where there are more rows than links, of each hand's axes."""
-    parts = states.position, states.direction, states.linear_velocity, states.angular_velocity
-    rows = jnp.stack([jnp.asarray(part) for part in parts], axis=1)
-    hand = states.hand
-    if hand is not None and count > len(rows):
-        position, velocity = (jnp.repeat(x, 3, axis=0) for x in (hand.position, hand.angular_velocity))
-        of_hands = position, hand.axes, jnp.zeros_like(position), velocity
-        rows = jnp.concatenate([rows, jnp.stack(of_hands, axis=1)])
-    return rows.ravel()
 
 
 def _is_constant(tree: Any) -> bool:

@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import math
 import os
 import socket
 import sys
@@ -59,7 +60,8 @@ class MetricsLog:
             os.truncate(self._path, size)
             raise
         for name, value in metrics.items():
-            self._write_event(step=step, summary=self._tensorboard.summary.scalar(name, value))
+            if math.isfinite(value):  # what is not has no place in a plot, and tensorboardX prints a line
+                self._write_event(step=step, summary=self._tensorboard.summary.scalar(name, value))
         self._records.flush()
 
     def _write_event(self, **content: Any) -> None:

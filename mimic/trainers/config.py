@@ -9,9 +9,9 @@ from mimic.base import registry
 from mimic.base.config import check_choice
 from mimic.base.ranges import check_ranges, number, seed_number
 from mimic.envs import env_config, environments
-from mimic.envs.config import EnvConfig, ObservationConfig
+from mimic.envs.config import EnvConfig
 from mimic.runs.distributed.process_group import DistributedConfig
-from mimic.trainers.presets import MAPPER_PRESETS, OBSERVED_TERMS, PPO_PRESETS, PPO_PRESETS_OF
+from mimic.trainers.presets import MAPPER_PRESETS, PPO_PRESETS, PPO_PRESETS_OF
 
 if TYPE_CHECKING:
     _Value = TypeVar("_Value")
@@ -348,13 +348,8 @@ class TrainConfig:
         check_choice("logger", self.logger, LOGGERS)
 
     def resolve(self, backend: str = "cpu", devices: int = 1) -> Self:
-        """The config with a resolved trainer, see `TrainerConfig.resolve`, and with the terms that it observes."""
-        env, trainer = self.env, self.trainer.resolve(backend, devices, env=self.env)
-        has_preset_terms = env.kind == "one_arm" and not env.environment and isinstance(trainer, PPOConfig)
-        if has_preset_terms and env.observation.terms is None:
-            observed = ObservationConfig(OBSERVED_TERMS.get(trainer.preset, []))
-            env = dataclasses.replace(env, observation=observed)
-        return dataclasses.replace(self, env=env, trainer=trainer)
+        """The config with a resolved trainer, see `TrainerConfig.resolve`."""
+        return dataclasses.replace(self, trainer=self.trainer.resolve(backend, devices, env=self.env))
 
     def check_used(self) -> None:
         """Raises a ValueError for a field of the environment that its user changed and the trainer does not use."""

@@ -76,10 +76,6 @@ PPO_PRESETS["any_arm"] |= {"num_timesteps": 30_000_000}
 # Layers twice as wide have about the same gap (docs/hardware_world.md), and a robot's computer takes longer for them.
 PPO_PRESETS["inner_loop"] |= {"num_timesteps": 120_000_000, "hidden_layers": [256, 128]}
 
-# What a learner observes besides link states where `env.observation.terms` is null. After the few steps of the preset
-# "cpu" a policy that observes the gradient reverses its torques at each step, a change of 60 % of the maximum.
-OBSERVED_TERMS = {"gpu": ["distance_gradient"]}
-
 MAPPER_PRESETS: dict[str, dict[str, Any]] = {
     # Network, training set and minibatches are the paper's. The paper does not state optimiser, rate, epochs, patience.
     "paper": {

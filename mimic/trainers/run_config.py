@@ -15,7 +15,6 @@ from mimic.base.config import check_new, check_writable, explain, flatten, merge
 from mimic.base.config_files import check_references, read_config
 from mimic.base.files import write_atomically
 from mimic.base.overrides import setting, shell_words
-from mimic.envs.config import ObservationConfig
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, DEMONSTRATIONS
 from mimic.runs.lock import LOCK
@@ -175,6 +174,5 @@ def errors_of_networks(config: TrainConfig, run_dir: Path, key: str) -> Iterator
 
 def _of_networks(config: TrainConfig) -> dict[str, Any]:
     """The settings on which the sizes of a run's networks depend, by their keys."""
-    env = dataclasses.replace(config.env, observation=ObservationConfig(config.env.observed_terms))
-    values = flatten({"env": to_dict(env), "trainer": to_dict(config.trainer)})
+    values = flatten({"env": to_dict(config.env), "trainer": to_dict(config.trainer)})
     return {key: value for key, value in values.items() if key.startswith(_OF_NETWORKS)}

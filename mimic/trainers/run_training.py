@@ -98,6 +98,8 @@ def prepare_training(
     is_first = group is None or group.first
     if not resumed_dir:
         config.check_used()
+        if config.init and has_network(Path(config.init).expanduser()):
+            raise ValueError(f"init: expected a run directory with checkpoints, got {config.init!r}, a network alone")
     if config.logger == "wandb":
         wandb_package()
     run_dir = resumed_dir or (new_run_dir(config) if is_first else Path())
@@ -148,8 +150,6 @@ def _start(config: TrainConfig, resumed_dir: Path | None, trainer: Trainer, is_c
         if not config.init:
             return None
         init = Path(config.init).expanduser()
-        if has_network(init):
-            raise ValueError(f"init: expected a run directory with checkpoints, got {config.init!r}, a network alone")
         with errors_of_networks(resolved, init, "init"):
             return Checkpoint(0, load_checkpoint(init, trainer.params_template())[1], None, {})
     with errors_of_networks(resolved, resumed_dir, "resume"):

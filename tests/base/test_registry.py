@@ -114,7 +114,7 @@ def test_a_bad_name_is_one_line(rejected, arguments, message):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ({"observation": {"terms": ["x"]}}, "observation.terms: expected one of distance_gradient, got 'x'"),
+        ({"observation": {"terms": ["x"]}}, "observation.terms: expected one of none, got 'x'"),
         ({"reward": {"terms": {"x": 1}}}, "reward.terms: expected one of self_collision, got 'x'"),
         ({"metric": {"link_distance": "x"}}, "link_distance: expected one of none, got 'x'"),
         ({"demonstrations": {"source": "x"}}, "demonstrations.source: expected one of none, got 'x'"),

@@ -59,10 +59,11 @@ def test_arms_are_named_by_their_files(tmp_path):
             {"reward": {"terms": {"self_collision": 1.0}}},
             "reward: expected the default where .*, got terms=.*self_coll",
         ),
-        ({"observation": {"terms": ["distance_gradient"]}}, "observation: expected the default where .*, got terms="),
+        ({"observation": {"terms": ["own"]}}, "observation: expected the default where .*, got terms="),
     ],
 )
-def test_settings_of_one_learner_are_rejected(changes, message):
+def test_settings_of_one_learner_are_rejected(own_registry, changes, message):
+    mimic.register("observation_term", "own", lambda env, state: state.qpos)
     with pytest.raises(ValueError, match=message):
         mimic.make("panda_family", **changes)
 

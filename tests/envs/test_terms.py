@@ -45,7 +45,7 @@ def terms(own_registry):
 
 
 def test_terms_are_added(terms):
-    plain = mimic.make("planar4dof", physics="fused", observation={"terms": []}, **SMALL)
+    plain = mimic.make("planar4dof", physics="fused", **SMALL)
     env = make_env(mimic.env_config("planar4dof", physics="fused", **SMALL, **terms))
     action = jnp.array([0.5, -0.2, 0.1, 0.0])
     states = [one_step(plain, action), one_step(env, action)]
@@ -59,21 +59,6 @@ def test_terms_are_added(terms):
     layout = layout_of(env)
     assert [part["name"] for part in layout[-2:]] == ["term: angles", "term: demonstration"]
     assert layout[-1]["stop"] == env.observation_size and layout_of(plain)[-1]["stop"] == plain.observation_size
-
-
-@pytest.mark.slow
-def test_the_distance_gradient_is_that_of_finite_differences():
-    env = mimic.make("panda4dof", physics="fused", observation={"terms": ["distance_gradient"]}, **SMALL)
-    state = one_step(env, jnp.linspace(-0.5, 0.8, env.action_size)).pipeline_state
-    observed = np.asarray(jax.jit(env.observe)(state)[-2 * env.action_size :])
-    n, next_step = env.action_size, state.step + 1
-    distance = jax.jit(lambda motion: env.distance(motion[:n], motion[n:], state.demonstration, next_step))
-    motion, step = jnp.concatenate([state.qpos, state.qvel]), 1e-3  # float32
-    differences = [
-        (distance(motion + change) - distance(motion - change)) / (2 * step) for change in step * jnp.eye(len(motion))
-    ]
-    assert np.abs(observed[: env.action_size]).max() > 0.05
-    np.testing.assert_allclose(observed, differences, atol=5e-4)
 
 
 @pytest.mark.slow
@@ -98,8 +83,8 @@ def test_self_collision_is_charged_by_the_distances_of_capsules():
 
 
 def test_a_built_in_term_cannot_be_registered():
-    with pytest.raises(ValueError, match="'distance_gradient' is built in"):
-        mimic.register("observation_term", "distance_gradient", angles)
+    with pytest.raises(ValueError, match="'self_collision' is built in"):
+        mimic.register("reward_term", "self_collision", height)
 
 
 def test_ending_an_episode_early_is_never_better(own_registry, monkeypatch):

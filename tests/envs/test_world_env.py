@@ -184,7 +184,7 @@ def test_mjx_agrees_with_the_fused_loop():
             {"control_dt": 0.02},
             "world.action_latency: expected a multiple of 0.001 s below control_dt = 0.02 s, got 0.02",
         ),
-        ({"observation": {"terms": ["distance_gradient"]}}, "observation.terms: expected none with an inner loop"),
+        ({"observation": {"terms": ["own"]}}, "observation.terms: expected none with an inner loop"),
         (
             {"world": {"expert": "links", "hidden_links": [0, 7]}, "control": "torque"},
             "fewer than the expert's 7 links",
@@ -193,7 +193,8 @@ def test_mjx_agrees_with_the_fused_loop():
         ({"learner": "panda_pair", "expert": "panda_pair"}, "expected a serial arm"),
     ],
 )
-def test_what_does_not_fit_is_rejected(fields, message):
+def test_what_does_not_fit_is_rejected(own_registry, fields, message):
+    mimic.register("observation_term", "own", lambda env, state: state.qpos)
     with pytest.raises(ValueError, match=message):
         make(**fields)
 

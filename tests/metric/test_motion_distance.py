@@ -7,11 +7,9 @@ from jax.typing import DTypeLike
 from mimic import motion_distance
 from mimic.arms.embodiment import LONG, load_mjcf, panda, planar_arm
 from mimic.base import fused_kernel
-from mimic.metric import analytic_gradient
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
-from mimic.metric.distance import PAPER_WEIGHTS, DistanceWeights, Metric, embodiment_distance
+from mimic.metric.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
 from mimic.metric.kinematics import link_states
-from mimic.metric.motion_distance import gradient_by_learner
 from tests.helpers.lowering import gpu_program
 from tests.helpers.metric_cases import ALL_WEIGHTS, CORRESPONDENCES, EXPERT, LEARNER
 from tests.helpers.random_arms import random_arm
@@ -213,20 +211,3 @@ def test_the_gpu_agrees_with_double_precision():
         plain = jax.jit(jax.vmap(jax.value_and_grad(composed(arms, *metric), ALL_ARGUMENTS)))
         expected = plain(*(np.asarray(x, np.float64) for x in batch))
     assert largest_difference(actual, expected) < 1e-5  # float32, there and back over the joints
-
-
-def test_the_gradient_by_the_learner_is_traced_once(monkeypatch):
-    arms = [load_mjcf(random_arm(seed)) for seed in (21, 22)]
-    metric = Metric(overlap_correspondence(*arms), DistanceWeights(rotation=1.0))
-    *expert, qpos, qvel = motions(arms, dtype=np.float32)
-    states, traced = link_states(arms[0], *(x[0] for x in expert)), []
-    original = analytic_gradient.gradient_by_states
-
-    def counted(*arguments):
-        traced.append(arguments)
-        return original(*arguments)
-
-    monkeypatch.setattr(analytic_gradient, "gradient_by_states", counted)
-    for learner in (arms[1], load_mjcf(random_arm(22))):
-        jax.jit(jax.vmap(lambda *own, learner=learner: gradient_by_learner(metric, learner, states, *own)))(qpos, qvel)
-        assert len(traced) == 3  # of one arm that is read twice: a sample, a batch of them, and the kernel for GPUs

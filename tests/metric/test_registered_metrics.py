@@ -1,14 +1,11 @@
 """Correspondences and distances of registered functions."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mimic
 from mimic.metric.config import MetricConfig
 from mimic.metric.distance import LinkDistance
-from mimic.metric.motion_distance import gradient_by_learner
 
 EXPERT, LEARNER = mimic.planar_arm([0.5, 0.3, 0.2]), mimic.planar_arm([0.6, 0.4])
 MATRIX = np.array([[1.0, 0.0], [0.5, 0.5], [0.0, 2.0]])
@@ -53,19 +50,6 @@ def test_a_bad_matrix_is_one_line(own_registry, matrix, message):
     with pytest.raises(ValueError, match=message) as error:
         MetricConfig(correspondence="bad").build(EXPERT, LEARNER)
     assert "\n" not in str(error.value)
-
-
-def test_the_gradient_of_a_link_distance_is_0_where_it_is_not_finite(own_registry):
-    mimic.register("link_distance", "norm", lambda expert, learner: jnp.linalg.norm(expert.position - learner.position))
-    metric = MetricConfig(link_distance="norm").build(EXPERT, EXPERT)
-
-    def gradient(angle):
-        states = mimic.link_states(EXPERT, jnp.full(3, angle))
-        return gradient_by_learner(metric, EXPERT, states, jnp.zeros(3), jnp.zeros(3))
-
-    same, moved = map(jax.jit(gradient), (0.0, 0.1))
-    np.testing.assert_array_equal(same, 0)
-    assert np.all(np.abs(moved[:3]) > 0.01)
 
 
 def test_a_registered_link_distance_replaces_the_weighted_parts(own_registry):

@@ -11,7 +11,6 @@ from mimic.metric.analytic_gradient import distance_and_gradient
 from mimic.metric.config import MetricConfig
 from mimic.metric.correspondence import arc_length_correspondence, overlap_correspondence
 from mimic.metric.kinematics import link_state_table, link_states
-from mimic.metric.motion_distance import gradient_by_learner
 from mimic.metric.similarity import MEASURES, centre_line, centre_line_table, similarity
 from mimic.retargeting.costs import hand_cost
 from mimic.retargeting.pose_objective import pose_objective
@@ -47,16 +46,6 @@ def test_a_tree_has_no_distance_from_itself(x64, request, name, correspondence):
     metric = MetricConfig(correspondence=correspondence, linear_velocity=1.0, angular_velocity=1.0).build(arm, arm)
     states, other = (link_state_table(arm, *pose(arm, seed), float) for seed in (0, 1))
     assert float(metric(states, states)) == 0 and float(metric(states, other)) > 0.1
-
-
-@pytest.mark.parametrize("settings", [{}, {"hand_rotation": 0.0}, {"rotation_measure": "angle", "hand_rotation": 0.0}])
-def test_the_gradient_by_the_learner_equals_automatic_differentiation(x64, body, longer, settings):
-    metric = MetricConfig(**settings, linear_velocity=0.1).build(body, longer)
-    states, own = link_states(body, *pose(body)), pose(longer, 1)
-    expected = jax.grad(lambda *own: metric(states, link_states(longer, *own)), argnums=(0, 1))(*own)
-    actual = gradient_by_learner(metric, longer, states, *map(jnp.asarray, own))
-    np.testing.assert_allclose(actual, np.concatenate(expected), atol=1e-14)
-    assert np.abs(actual).max() > 1e-2 and metric.is_static == ("rotation_measure" not in settings)
 
 
 def _sides(arm, link):

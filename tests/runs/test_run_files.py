@@ -17,6 +17,13 @@ from mimic.runs.metrics_log import MetricsLog
 from tests.helpers.run_directories import rows_of
 
 
+def test_a_metric_that_is_not_finite_prints_nothing(tmp_path, caplog):
+    log = MetricsLog(tmp_path)
+    log.write(1, {"quality/gap": float("nan"), "loss": float("inf")})
+    log.close()
+    assert rows_of(tmp_path) == [{"step": "1", "quality/gap": "nan", "loss": "inf"}] and not caplog.records
+
+
 def test_a_report_is_json_even_after_a_divergence(tmp_path):
     write_report(tmp_path, {"gap": {"train": float("nan"), "held_out": 0.5}, "worst": [float("inf"), 1]})
     text = (tmp_path / REPORT).read_text()

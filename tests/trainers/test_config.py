@@ -1,12 +1,10 @@
 """Resolved configs of trainers."""
 
-import dataclasses
 import math
 
 import pytest
 
 import mimic
-from mimic.envs.config import ObservationConfig
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer
 
@@ -24,21 +22,6 @@ def test_presets_follow_the_backend_and_the_environment():
     assert family.resolve().trainer.network == "joints"  # type: ignore[attr-defined] - the settings of PPO
     for backend in ("cpu", "gpu"):
         assert PoseMapperConfig().resolve(backend, env=mimic.env_config("panda4dof")).preset == "large"
-
-
-def test_a_preset_chooses_what_is_observed_where_the_user_does_not():
-    def observed(backend, env, trainer=None):
-        return TrainConfig(env, trainer or PPOConfig()).resolve(backend).env.observation.terms
-
-    panda, gradient = mimic.env_config("panda4dof"), ["distance_gradient"]
-    assert observed("gpu", panda) == observed("cpu", panda, PPOConfig(preset="gpu")) == gradient
-    assert observed("cpu", panda) == []
-    for terms in ([], gradient):
-        own = dataclasses.replace(panda, observation=ObservationConfig(terms))
-        assert observed("cpu", own) == observed("gpu", own) == terms
-    for others in (mimic.env_config("panda_family"), mimic.env_config("panda4dof", world="nominal")):
-        assert observed("gpu", others) is None
-    assert observed("gpu", panda, PoseMapperConfig()) is None
 
 
 def test_the_network_of_joints_needs_a_drawn_learner():

@@ -140,8 +140,7 @@ def _policy_sizes(config: TrainConfig) -> tuple[int, int]:
     from mimic.envs.imitation import observation_layout
 
     expert, learner = map(config.env.metric.compared, config.env.build_arms().embodiments)
-    terms = dict.fromkeys(config.env.observed_terms, 2 * learner.num_joints)  # the built-in one
-    return observation_layout(expert, learner, config.env.preview, terms)[-1]["stop"], learner.num_joints
+    return observation_layout(expert, learner, config.env.preview, {})[-1]["stop"], learner.num_joints
 
 
 def _policy(folder: Path, config: TrainConfig) -> Function:

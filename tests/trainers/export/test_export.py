@@ -33,8 +33,7 @@ TOLERANCE = 1e-5  # rad, or a fraction of the maximum torque: float32, sums in a
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
     """The environment and the policy of a run with random weights and observation statistics, and its export."""
-    terms = {"terms": ["distance_gradient"]}
-    env = mimic.make("panda4dof", demonstrations={"count": 1, "held_out": 1}, observation=terms)
+    env = mimic.make("panda4dof", demonstrations={"count": 1, "held_out": 1})
     run_dir = untrained_run(tmp_path_factory.mktemp("policy") / "run", env.config)
     config = load_config(run_dir).trainer
     networks = make_networks(config, env.observation_size, env.action_size, env.privileged_size)
@@ -93,9 +92,9 @@ def test_the_metadata_describes_inputs_and_outputs(policy):
             part = layout[f"{whose}: {name}"]
             observed = state.obs[part["start"] : part["stop"]].reshape(part["shape"])
             np.testing.assert_allclose(observed, values, atol=1e-6)
-    gradient = [layout[f"distance_gradient: by the learner's {name}"] for name in ("angles", "joint velocities")]
-    assert [(part["shape"], part["unit"]) for part in gradient] == [([4], "1/rad"), ([4], "s/rad")]
-    assert gradient[1]["stop"] == max(part["stop"] for part in layout.values()) == env.observation_size
+    speeds = layout["learner: joint velocities"]
+    assert (speeds["shape"], speeds["unit"]) == ([4], "rad/s")
+    assert speeds["stop"] == max(part["stop"] for part in layout.values()) == env.observation_size
 
 
 OTHER_METRIC = {"translation": 1.0, "correspondence": "soft", "rotation_measure": "angle", "reduction": "frobenius"}

@@ -94,12 +94,10 @@ def test_a_batch_is_the_same_as_its_samples():
     assert np.abs(outputs).max() <= 1
 
 
-@pytest.mark.parametrize("terms", [["distance_gradient"], []])
-def test_a_policy_reads_what_its_environment_observes(terms):
-    changes = {"observation": {"terms": terms}, "demonstrations": {"count": 2, "held_out": 1}}
-    env = mimic.make("planar4dof", **changes)
+def test_a_policy_reads_what_its_environment_observes():
+    env = mimic.make("planar4dof", demonstrations={"count": 2, "held_out": 1})
     statistics, _ = policy_template(dataclasses.replace(mimic.load("planar4dof").config, env=env.config))
-    assert statistics.mean.shape == (env.observation_size,) == (OBSERVATION - (0 if terms else 8),)
+    assert statistics.mean.shape == (env.observation_size,) == (OBSERVATION,)
 
 
 def test_commands_take_the_environment_of_a_policy_as_their_run(tmp_path, monkeypatch):
