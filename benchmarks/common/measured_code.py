@@ -15,6 +15,7 @@ FOLDERS = (
     *("xml", "base", "control", "arms", "metric", "physics", "motions"),
     *("retargeting", "envs", "evaluation", "trainers", "conf"),
 )
+SUFFIXES = ".py", ".xml", ".yaml"  # of code and presets; the networks that come with mimic are neither
 # Benchmarks that measure up to a folder; all others measure trained policies, and so all folders.
 HIGHEST = {
     "hands": "arms",
@@ -47,7 +48,7 @@ def changed_code(files: Mapping[str, Results]) -> list[Cells]:
 
 @functools.cache
 def hash_of(folder: Path) -> str:
-    files = sorted(path for path in folder.rglob("*") if path.suffix in (".py", ".xml", ".yaml"))
+    files = sorted(path for path in folder.rglob("*") if path.suffix in SUFFIXES and "networks" not in path.parts)
     texts = (f"{path.relative_to(folder).as_posix()}\n{_without_words(path)}\n" for path in files)
     return hashlib.sha256("".join(texts).encode()).hexdigest()[:8]
 

@@ -26,7 +26,7 @@ from mimic.trainers.pretrained.network import TRAINERS, policy_template, read_ne
 from mimic.trainers.run_config import policy_run
 
 MAX_BYTES = 5_000_000  # of all of them: the package stays small
-OBSERVATION = 254  # numbers that the policy of planar4dof observes
+OBSERVATION = 246  # numbers that the policy of planar4dof observes
 DEFAULT = ("panda3dof", "panda4dof", "panda7dof", "planar4dof", "planar7dof")
 POLICIES, MAPPERS = (pretrained_names(kind) for kind in TRAINERS)
 FOLDERS = [f"{name}-{kind}" for kind in TRAINERS for name in pretrained_names(kind)]
