@@ -5,6 +5,7 @@ calls `check_ranges`. A subclass that declares the field again without a range k
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -116,6 +117,7 @@ def checkpoint_number() -> Any:
     return number(None, at_least=0, at_most=10**15)
 
 
+@functools.cache
 def ranges(config_class: type) -> dict[str, Range]:
     """The ranges of a dataclass by field, including those that its bases declare."""
     return {

@@ -314,12 +314,12 @@ def _weight(part: str, value: Any, distances: Array) -> Any:
 
 def check_matrix(name: str, matrix: np.ndarray) -> None:
     """Raises a ValueError that starts with the name for a W of anything but finite numbers from 0 on."""
-    if matrix.dtype.kind not in "biuf" or not np.all(np.isfinite(matrix)):
+    is_real = matrix.dtype.kind in "biuf"
+    if is_real and np.all((matrix >= 0) & (matrix <= _MAX_MATRIX)):
+        return
+    if not is_real or not np.all(np.isfinite(matrix)):
         raise ValueError(f"{name}: expected finite numbers")
-    if np.any(matrix < 0) or np.any(matrix > _MAX_MATRIX):
-        raise ValueError(
-            f"{name}: expected numbers from 0 to {_MAX_MATRIX:g}, got {matrix.min():g} to {matrix.max():g}"
-        )
+    raise ValueError(f"{name}: expected numbers from 0 to {_MAX_MATRIX:g}, got {matrix.min():g} to {matrix.max():g}")
 
 
 def _check_weights(weights: Any) -> None:
