@@ -42,11 +42,11 @@ def floats(values: ArrayLike, name: str) -> Any:
     Raises:
       ValueError: rows of different lengths, or entries that are no real numbers.
     """
-    is_array = type(values) is np.ndarray or isinstance(values, jax.Array)
-    if is_array and values.dtype in _FLOATS:  # at once: a live pose takes 0.3 ms
-        return values
+    array: Any = values
+    if (type(array) is np.ndarray or isinstance(array, jax.Array)) and array.dtype in _FLOATS:
+        return array  # at once: a live pose takes 0.3 ms
     try:
-        array: Any = jnp.asarray(values) if has_tracer(values) else values
+        array = jnp.asarray(values) if has_tracer(values) else values
         array = array if isinstance(array, jax.Array) else np.asarray(array)
     except ValueError:
         raise ValueError(f"{name}: expected rows of one length, got {values!r:.80}") from None
