@@ -29,8 +29,7 @@ TRAINER = {
 def fitted(tmp_path_factory):
     """A run, and the environment that it was trained in."""
     env = mimic.make("planar4dof", **SMALL)
-    trainer = {**TRAINER, "preset": "gpu"}  # which adds a term to what a named environment observes
-    return mimic.fit(env, trainer=trainer, seed=3, run_dir=str(tmp_path_factory.mktemp("fit") / "run"), quiet=True), env
+    return mimic.fit(env, trainer=TRAINER, seed=3, run_dir=str(tmp_path_factory.mktemp("fit") / "run"), quiet=True), env
 
 
 @pytest.mark.slow

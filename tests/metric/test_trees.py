@@ -79,9 +79,11 @@ def test_traced_lengths_give_the_same_correspondence(x64, body, longer):
 
 
 def test_gradients_in_closed_form(x64, body, longer):
-    """Against finite differences, on a batch of motions without compilation."""
+    """Of links and two hands, against finite differences, on a batch of motions without compilation."""
     arms, motion = (in_chain_lengths(body), in_chain_lengths(longer)), [*pose(body), *pose(longer, 1)]
-    factors = np.array([1.0, 0.5, 0.1, 0.2])[:, None, None] * np.asarray(arc_length_correspondence(*arms))
+    weights = {"translation": 0.5, "linear_velocity": 0.1, "angular_velocity": 0.2, "hand_position": 0.3}
+    metric = MetricConfig(**weights).build(body, longer)
+    factors = np.asarray(metric.factors(*(len(arm.hand_joint) for arm in arms)))
     values, step = np.concatenate(motion), 1e-5
     shifts = step * np.eye(len(values))
     batch = jnp.asarray(np.concatenate([values + shifts, values - shifts, values[None]])).T
@@ -91,6 +93,9 @@ def test_gradients_in_closed_form(x64, body, longer):
     above, below = np.split(np.asarray(distance)[:-1], 2)
     differences = (above - below) / (2 * step)
     np.testing.assert_allclose(gradient, differences, atol=1e-7 * np.abs(differences).max())
+    states = link_states(body, *motion[:2]), link_states(longer, *motion[2:])
+    assert factors.shape[1:] == (body.num_links + 6, longer.num_links + 6)  # a row for each axis of a hand
+    assert np.asarray(distance)[-1] == pytest.approx(float(metric(*states)), rel=1e-12)
 
 
 @pytest.mark.slow
